@@ -1,0 +1,5 @@
+"""jaxouter learns an outer loop: it sees the reference r and the output y, and chooses the modified reference r~."""
+
+from jaxouter.loop.environment import make
+
+__all__ = ["make"]

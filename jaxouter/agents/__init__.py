@@ -1,0 +1,1 @@
+"""Learners: networks, DDPG, exploration noise, replay. They know nothing of plants."""

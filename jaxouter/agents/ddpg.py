@@ -1,0 +1,253 @@
+"""Deep deterministic policy gradient, functional; TD3's three tricks are settings of the same learner.
+
+One transition is unbatched in the small functions; `update` vmaps them over a batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxouter.agents.networks import Actor, Critic
+
+
+@dataclass(frozen=True)
+class DDPGConfig:
+    """Settings of the learner; the defaults are the paper's (and Lillicrap's where the paper is silent)."""
+
+    hidden: tuple[int, ...] = (400, 300)
+    """Widths of the hidden layers of actor and critic; at least two."""
+    layer_norm: bool = False
+    """LayerNorm in the critic, before each ReLU."""
+    actor_rate: float = 1e-4
+    """Learning rate of the actor (Adam)."""
+    critic_rate: float = 1e-3
+    """Learning rate of the critic (Adam)."""
+    rate_decay: Literal["constant", "cosine"] = "constant"
+    """How both learning rates fall over the training; cosine ends at zero."""
+    critic_l2: float = 1e-2
+    """L2 penalty on the critic's weights (half its square is added to the loss)."""
+    batch_size: int = 64
+    """Transitions an update."""
+    discount: float = 0.99
+    """Discount a control step (the paper's gamma)."""
+    polyak: float = 0.001
+    """Share of the networks that goes into the targets at each update (the paper's tau)."""
+    n_step: int = 1
+    """Steps of the return before it is bootstrapped."""
+    saturation_penalty: float = 0.0
+    """Weight of the mean square of the actor's output before its tanh, against saturation."""
+    critics: Literal[1, 2] = 1
+    """TD3: two critics, the smaller value is the target."""
+    policy_delay: int = 1
+    """TD3: the actor and the targets move at every so many critic updates."""
+    target_noise: float = 0.0
+    """TD3: standard deviation of the noise on the target action."""
+    target_noise_clip: float = 0.5
+    """TD3: largest such noise."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, naming field, value and what is allowed."""
+        positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay")
+        not_negative = ("critic_l2", "saturation_penalty", "target_noise", "target_noise_clip")
+        for field in positive:
+            if not getattr(self, field) > 0:
+                raise ValueError(f"ddpg.{field} is {getattr(self, field)}; it must be positive")
+        for field in not_negative:
+            if not getattr(self, field) >= 0:
+                raise ValueError(f"ddpg.{field} is {getattr(self, field)}; it must not be negative")
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"ddpg.discount is {self.discount}; it must lie in [0, 1)")
+        if not 0 < self.polyak <= 1:
+            raise ValueError(f"ddpg.polyak is {self.polyak}; it must lie in (0, 1]")
+        if len(self.hidden) < 2 or min(self.hidden) < 1:
+            raise ValueError(f"ddpg.hidden is {self.hidden}; it must be at least two positive widths")
+
+
+class Batch(NamedTuple):
+    """Transitions (B, ...)."""
+
+    obs: jax.Array  # (B, n)
+    action: jax.Array  # (B, m), in [-1, 1]
+    reward: jax.Array  # (B,), discounted sum over the n steps
+    discount: jax.Array  # (B,), of the bootstrapped value; 0 where terminated
+    next_obs: jax.Array  # (B, n)
+
+
+class LearnerState(NamedTuple):
+    """Everything that learning changes."""
+
+    actor: Any
+    critics: tuple[Any, ...]
+    target_actor: Any
+    target_critics: tuple[Any, ...]
+    actor_optimiser: optax.OptState
+    critic_optimiser: optax.OptState
+    updates: jax.Array  # int32
+
+
+def n_step_return(
+    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return of up to n consecutive steps (n,), ended by the first termination or truncation.
+
+    A truncated step is bootstrapped from its final observation, a terminated one (also if truncated too) is not.
+
+    Returns:
+        The discounted sum of rewards, the discount of the bootstrapped value (0 where terminated), and the index of
+        the last step used.
+    """
+    chex.assert_rank([reward, terminated, truncated], 1)
+    done = terminated | truncated
+    running = jnp.cumprod(jnp.concatenate([jnp.ones(1, bool), ~done[:-1]]).astype(reward.dtype))
+    powers = discount ** jnp.arange(reward.shape[0], dtype=reward.dtype)
+    last = jnp.sum(running).astype(jnp.int32) - 1
+    bootstrap = powers[last] * discount * jnp.where(terminated[last], 0.0, 1.0)
+    return jnp.sum(running * powers * reward), bootstrap, last
+
+
+def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
+    """g = R + discount Q'(s', mu'(s')), with the least of the target critics (paper eq. 4).
+
+    Args:
+        reward, discount: scalars; the discount is 0 where terminated.
+        next_q: (critics,).
+    """
+    return reward + discount * jnp.min(next_q)
+
+
+def _descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
+    """Parameters and optimiser state after one step."""
+    with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
+        step, state = optimiser.update(gradient, state, params)
+        return optax.apply_updates(params, step), state
+
+
+@dataclass(frozen=True)
+class DDPG:
+    """The learner for observations of `obs_size` numbers. Static and hashable; its state is a pytree."""
+
+    config: DDPGConfig
+    obs_size: int
+    action_size: int = 1
+    total_updates: int = 1
+    """Updates of the whole training, for the decay of the learning rates."""
+
+    @property
+    def actor(self) -> Actor:
+        """The actor network."""
+        return Actor(self.config.hidden, self.action_size)
+
+    @property
+    def critic(self) -> Critic:
+        """The critic network."""
+        return Critic(self.config.hidden, self.config.layer_norm)
+
+    def _rate(self, rate: float) -> float | optax.Schedule:
+        decays = self.config.rate_decay == "cosine"
+        return optax.cosine_decay_schedule(rate, max(1, self.total_updates)) if decays else rate
+
+    @property
+    def actor_optimiser(self) -> optax.GradientTransformation:
+        """Adam."""
+        return optax.adam(self._rate(self.config.actor_rate))
+
+    @property
+    def critic_optimiser(self) -> optax.GradientTransformation:
+        """Adam on the gradient of loss plus L2 penalty; biases are not penalised."""
+        adam = optax.adam(self._rate(self.config.critic_rate))
+        if self.config.critic_l2 == 0:
+            return adam
+
+        def kernels(params: Any) -> Any:
+            return jax.tree.map(lambda leaf: leaf.ndim > 1, params)
+
+        return optax.chain(optax.add_decayed_weights(self.config.critic_l2, kernels), adam)
+
+    def init(self, key: chex.PRNGKey) -> LearnerState:
+        """Random networks, targets equal to them."""
+        key_actor, *key_critics = jax.random.split(key, 1 + self.config.critics)
+        obs, action = jnp.zeros(self.obs_size), jnp.zeros(self.action_size)
+        actor = self.actor.init(key_actor, obs)
+        critics = tuple(self.critic.init(k, obs, action) for k in key_critics)
+        return LearnerState(
+            actor=actor,
+            critics=critics,
+            target_actor=jax.tree.map(jnp.copy, actor),  # copies: the state is donated, and no buffer twice
+            target_critics=jax.tree.map(jnp.copy, critics),
+            actor_optimiser=self.actor_optimiser.init(actor),
+            critic_optimiser=self.critic_optimiser.init(critics),
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def act(self, actor: Any, obs: jax.Array) -> jax.Array:
+        """mu(s): obs (..., n) -> action (..., m) in [-1, 1]."""
+        return jnp.tanh(self.actor.apply(actor, obs))
+
+    def values(self, critics: tuple[Any, ...], obs: jax.Array, action: jax.Array) -> jax.Array:
+        """Q of each critic: (B, n), (B, m) -> (B, critics)."""
+        return jnp.stack([self.critic.apply(critic, obs, action) for critic in critics], -1)
+
+    def update(
+        self, state: LearnerState, batch: Batch, key: chex.PRNGKey
+    ) -> tuple[LearnerState, dict[str, jax.Array]]:
+        """One gradient step of critic, actor and targets (paper eq. 2 to 5, algorithm 1).
+
+        Args:
+            state: learner.
+            batch: transitions (B, ...).
+            key: for TD3's target noise.
+
+        Returns:
+            The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99).
+        """
+        cfg = self.config
+        chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
+        next_action = self.act(state.target_actor, batch.next_obs)
+        if cfg.target_noise > 0:
+            noise = cfg.target_noise * jax.random.normal(key, next_action.shape, next_action.dtype)
+            noise = jnp.clip(noise, -cfg.target_noise_clip, cfg.target_noise_clip)
+            next_action = jnp.clip(next_action + noise, -1.0, 1.0)
+        next_q = self.values(state.target_critics, batch.next_obs, next_action)
+        target = jax.vmap(td_target)(batch.reward, batch.discount, next_q)
+
+        def critic_loss(critics: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+            q = self.values(critics, batch.obs, batch.action)
+            return jnp.mean(jnp.sum((target[:, None] - q) ** 2, -1)), jnp.mean(q)
+
+        (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
+        critics, critic_optimiser = _descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
+        state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
+
+        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array]]:
+            def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
+                before_tanh = self.actor.apply(actor, batch.obs)
+                action = jnp.tanh(before_tanh)
+                value = self.critic.apply(state.critics[0], batch.obs, action)
+                loss = -jnp.mean(value) + cfg.saturation_penalty * jnp.mean(before_tanh**2)
+                return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
+
+            (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
+            actor, optimiser = _descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
+            state = state._replace(
+                actor=actor,
+                actor_optimiser=optimiser,
+                target_actor=optax.incremental_update(actor, state.target_actor, cfg.polyak),
+                target_critics=optax.incremental_update(state.critics, state.target_critics, cfg.polyak),
+            )
+            return state, (loss, saturation)
+
+        if cfg.policy_delay == 1:
+            state, (actor_value, saturation) = move_actor(state)
+        else:
+            zeros = (jnp.zeros_like(critic_value), jnp.zeros_like(critic_value))
+            state, (actor_value, saturation) = jax.lax.cond(
+                state.updates % cfg.policy_delay == 0, move_actor, lambda s: (s, zeros), state
+            )
+        metrics = dict(critic_loss=critic_value, actor_loss=actor_value, q=q, saturation=saturation)
+        return state, metrics

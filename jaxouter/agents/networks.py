@@ -1,0 +1,53 @@
+"""Actor and critic of the paper (section III-A; Lillicrap et al. 2015, supplement)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+
+def dense(features: int, fan_in: int, limit: float | None = None) -> nn.Dense:
+    """A dense layer, weights and biases uniform in plus or minus `limit` (None: 1/sqrt(fan_in))."""
+    bound = fan_in**-0.5 if limit is None else limit
+
+    def uniform(key: jax.Array, shape: Sequence[int], dtype: Any = float) -> jax.Array:
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return nn.Dense(features, kernel_init=uniform, bias_init=uniform, param_dtype=float)
+
+
+class Actor(nn.Module):
+    """mu(s) before its tanh."""
+
+    hidden: tuple[int, ...]
+    actions: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        """obs (..., n) -> pre-activation (..., actions); the action is its tanh."""
+        x = obs
+        for features in self.hidden:
+            x = nn.relu(dense(features, x.shape[-1])(x))
+        return dense(self.actions, x.shape[-1], 3e-3)(x)
+
+
+class Critic(nn.Module):
+    """Q(s, a); the action enters at the second layer."""
+
+    hidden: tuple[int, ...]
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """obs (..., n), action (..., actions) -> Q (...)."""
+        x = obs
+        for i, features in enumerate(self.hidden):
+            x = jnp.concatenate([x, action], -1) if i == 1 else x
+            x = dense(features, x.shape[-1])(x)
+            x = nn.LayerNorm(param_dtype=float)(x) if self.layer_norm else x
+            x = nn.relu(x)
+        return dense(1, x.shape[-1], 3e-3)(x)[..., 0]

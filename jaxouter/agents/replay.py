@@ -1,0 +1,87 @@
+"""Replay: a ring of rows for each of E environments, in one float32 array, sampled in windows of consecutive rows.
+
+The last rows of the ring stand once more in front of the first, so that every window is one contiguous slice, also
+where the ring wraps around. A row is a record of named fields; the field `age` (steps since the reset) is required: it
+tells which rows of a window belong to one episode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+class ReplayState(NamedTuple):
+    """Contents of the replay."""
+
+    rows: jax.Array  # (E, mirror + steps, width), float32
+    count: jax.Array  # int32, rows written so far in each environment
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Layout of a replay. Static and hashable."""
+
+    fields: tuple[str, ...]
+    """Names of a row's columns."""
+    environments: int
+    steps: int
+    """Rows kept for each environment."""
+    lead: int
+    """Rows before the first one of a window that come with it (the history of an observation)."""
+    window: int = 1
+    """Rows of a window that may be used as transitions (n of n-step returns)."""
+
+    def __post_init__(self) -> None:
+        if self.steps <= 2 * self.mirror:
+            raise ValueError(
+                f"the replay keeps {self.steps} steps of each of {self.environments} environments, "
+                f"but windows are {self.mirror + 1} steps long; it must keep more than {2 * self.mirror}"
+            )
+
+    @property
+    def mirror(self) -> int:
+        """Rows that stand twice."""
+        return self.lead + self.window - 1
+
+    def init(self) -> ReplayState:
+        """An empty replay."""
+        shape = (self.environments, self.mirror + self.steps, len(self.fields))
+        return ReplayState(jnp.zeros(shape, jnp.float32), jnp.zeros((), jnp.int32))
+
+    def write(self, state: ReplayState, rows: jax.Array) -> ReplayState:
+        """Add one row (width,) of each environment: rows (E, width)."""
+        chex.assert_shape(rows, (self.environments, len(self.fields)))
+        slab = rows.astype(jnp.float32)[:, None, :]
+        position = state.count % self.steps + self.mirror
+        twin = jnp.where(position >= self.steps, position - self.steps, position)
+        buffer = jax.lax.dynamic_update_slice(state.rows, slab, (0, position, 0))
+        buffer = jax.lax.dynamic_update_slice(buffer, slab, (0, twin, 0))
+        return ReplayState(buffer, state.count + 1)
+
+    def sample(self, state: ReplayState, key: chex.PRNGKey, n: int) -> tuple[jax.Array, jax.Array]:
+        """Windows drawn uniformly, with replacement.
+
+        At least `window` rows must have been written. Once the ring is full, rows whose lead is already overwritten
+        are not drawn.
+
+        Returns:
+            rows (n, lead + window, width) and `valid` (n, lead + window): which rows lie in the same episode as row
+            `lead`, the first transition. Rows that are not valid hold other episodes, or nothing.
+        """
+        key_environment, key_row = jax.random.split(key)
+        environment = jax.random.randint(key_environment, (n,), 0, self.environments)
+        oldest = jnp.maximum(self.window - 1, state.count - self.steps + self.mirror)
+        last = jax.random.randint(key_row, (n,), oldest, state.count)  # number of a window's last row
+        size = (1, self.mirror + 1, len(self.fields))
+        rows = jax.vmap(lambda e, i: jax.lax.dynamic_slice(state.rows, (e, i, jnp.zeros_like(i)), size)[0])(
+            environment, last % self.steps
+        )
+        rows = rows.astype(float)  # the float of the learner
+        age = rows[:, :, self.fields.index("age")]
+        offset = jnp.arange(self.mirror + 1, dtype=age.dtype) - self.lead
+        return rows, age - age[:, self.lead, None] == offset[None, :]

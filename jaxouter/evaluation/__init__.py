@@ -1,0 +1,1 @@
+"""Evaluation: scenarios, roll-outs, figures of merit, figures."""

@@ -1,0 +1,172 @@
+"""Roll-outs of any policy on the episodes of a scenario."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.loop import rewards, sensor
+from jaxouter.loop.policy import Policy
+from jaxouter.plants import Plant
+
+
+class Traces(NamedTuple):
+    """What happened; arrays (episodes, T) but for y0. y is the output after each control step."""
+
+    y0: Any  # (episodes,)
+    r: Any
+    y: Any
+    r_tilde: Any
+    reward: Any
+    each_outside: Any  # share of the single outputs outside the limits; nan where the plant has no members
+    each_excess: Any  # by how much the worst of them is
+    members: Any  # (episodes, T, n) where asked for, else None
+
+
+class _Run(NamedTuple):
+    """State of a roll-out at t_k."""
+
+    plant: Any
+    y: jax.Array
+    y_seen: jax.Array
+    r_tilde: jax.Array
+
+
+class _Inputs(NamedTuple):
+    """What one episode is made of, beside the policy."""
+
+    params: Any
+    change: tuple[jax.Array, Any] | None
+    sensor: sensor.SensorParams
+    reward: rewards.RewardParams
+
+
+def excess(plant: Plant, y: jax.Array, y_before: jax.Array) -> jax.Array:
+    """By how much y (any shape) is outside the plant's limits; at most 0 where inside."""
+    over = jnp.full_like(y, -jnp.inf)
+    if plant.output_limit is not None:
+        over = jnp.maximum(over, jnp.abs(y) - plant.output_limit)
+    if plant.rate_limit is not None:
+        over = jnp.maximum(over, jnp.abs(y - y_before) - plant.rate_limit)
+    return over
+
+
+def _begin(plant: Plant, inputs: _Inputs, key: chex.PRNGKey) -> _Run:
+    key_start, key_sensor = jax.random.split(key)
+    state = plant.init(key_start, inputs.params)
+    y = plant.output(inputs.params, state)
+    return _Run(state, y, sensor.measure(inputs.sensor, key_sensor, y, y), jnp.clip(y, *plant.r_tilde_bounds))
+
+
+def _advance(
+    plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: jax.Array, r: jax.Array, r_tilde: jax.Array, key: Any
+) -> tuple[_Run, dict[str, jax.Array]]:
+    """One control step of the plant, r~ clipped to its bounds."""
+    key_plant, key_sensor = jax.random.split(key)
+    params = inputs.params
+    if inputs.change is not None:
+        at, after = inputs.change
+        params = jax.tree.map(lambda a, b: jnp.where(k >= at, a, b), after, params)
+    r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
+    state = plant.step(params, run.plant, r_tilde, key_plant)
+    y = plant.output(params, state)
+    out = dict(y=y, r_tilde=r_tilde, reward=rewards.reward(inputs.reward, r, y, run.y, r_tilde, run.r_tilde))
+    if plant.members is not None:
+        members = plant.members(params, state)
+        over = excess(plant, members, plant.members(params, run.plant))
+        out |= dict(each_outside=jnp.mean(jnp.where(over > 0, 1.0, 0.0)), each_excess=jnp.max(over))
+        out |= dict(members=members) if record else {}
+    y_seen = sensor.measure(inputs.sensor, key_sensor, y, run.y_seen)
+    return _Run(state, y, y_seen, r_tilde), out
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inputs: _Inputs, r: Any, keys: Any) -> Any:
+    def episode(inputs: _Inputs, r: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, dict[str, jax.Array]]:
+        key_begin, key_policy, key_run = jax.random.split(key, 3)
+        run = _begin(plant, inputs, key_begin)
+
+        def step(carry: tuple[_Run, Any], x: Any) -> tuple[tuple[_Run, Any], dict[str, jax.Array]]:
+            run, memory = carry
+            k, r_k, key, key_act = x
+            memory, r_tilde = policy.act(policy_params, memory, r_k, run.y_seen, key_act)
+            run, out = _advance(plant, record, inputs, run, k, r_k, r_tilde, key)
+            return (run, memory), out
+
+        steps = r.shape[0]
+        xs = (jnp.arange(steps), r, jax.random.split(key_run, steps), jax.random.split(key_policy, steps))
+        memory = policy.init(policy_params, r[0], run.y_seen)
+        return run.y, jax.lax.scan(step, (run, memory), xs)[1]
+
+    axes = _Inputs(0, None if inputs.change is None else (None, 0), None, None)
+    return jax.vmap(episode, (axes, 0, 0))(inputs, r, keys)
+
+
+def rollout(policy: Policy, policy_params: Any, scenario: Scenario, record_members: bool = False) -> Traces:
+    """Run a policy on every episode of a scenario, without an early end.
+
+    Args:
+        policy: JAX policies run jitted and vmapped; those with `host` True are called step by step with NumPy scalars.
+        policy_params: its parameters.
+        scenario: the episodes.
+        record_members: keep the single outputs (the temperature of each house) too.
+
+    Returns:
+        Traces as NumPy arrays.
+    """
+    plant = scenario.plant
+    change = None if scenario.change is None else (jnp.asarray(scenario.change[0]), scenario.change[1])
+    inputs = _Inputs(scenario.params, change, scenario.sensor, rewards.params(plant))
+    run = _host_rollout if policy.host else _rollout
+    y0, out = run(plant, policy, record_members, policy_params, inputs, scenario.r, scenario.keys)
+    out = {name: np.asarray(value) for name, value in out.items()}
+    nothing = np.full(out["y"].shape, np.nan)
+    return Traces(
+        y0=np.asarray(y0),
+        r=np.asarray(scenario.r),
+        y=out["y"],
+        r_tilde=out["r_tilde"],
+        reward=out["reward"],
+        each_outside=out.get("each_outside", nothing),
+        each_excess=out.get("each_excess", nothing),
+        members=out.get("members"),
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _begin_all(plant: Plant, inputs: _Inputs, keys: Any) -> _Run:
+    return jax.vmap(_begin, (None, _Inputs(0, None, None, None), 0))(plant, inputs._replace(change=None), keys)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _advance_all(plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: Any, r: Any, r_tilde: Any, keys: Any) -> Any:
+    axes = _Inputs(0, None if inputs.change is None else (None, 0), None, None)
+    step = partial(_advance, plant, record)
+    return jax.vmap(step, (axes, 0, None, 0, 0, 0))(inputs, run, k, r, r_tilde, keys)
+
+
+def _host_rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inputs: _Inputs, r: Any, keys: Any):
+    """The same episodes with a policy in plain Python; the keys are those of `_rollout`."""
+    steps = r.shape[1]
+    key_begin, key_policy, key_run = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
+    run_keys, act_keys = (jax.vmap(lambda key: jax.random.split(key, steps))(key) for key in (key_run, key_policy))
+    run = _begin_all(plant, inputs, key_begin)
+    y0, outs = run.y, []
+    memories = [policy.init(policy_params, r_0, y) for r_0, y in zip(np.asarray(r[:, 0]), np.asarray(y0), strict=True)]
+    for k in range(steps):
+        y_seen = np.asarray(run.y_seen)
+        acts = [
+            policy.act(policy_params, memory, r_k, y, key)
+            for memory, r_k, y, key in zip(memories, np.asarray(r[:, k]), y_seen, act_keys[:, k], strict=True)
+        ]
+        memories = [memory for memory, _ in acts]
+        r_tilde = jnp.asarray([float(value) for _, value in acts])
+        run, out = _advance_all(plant, record, inputs, run, jnp.asarray(k), r[:, k], r_tilde, run_keys[:, k])
+        outs.append(out)
+    return y0, jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *outs)

@@ -1,0 +1,1 @@
+"""What surrounds a plant: references, rewards, sensor, observation, policies, identification, the environment."""

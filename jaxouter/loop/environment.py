@@ -1,0 +1,143 @@
+"""The environment around a plant, in the style of gymnax 1.0: pure functions, traced parameters.
+
+    env, params = jaxouter.make("pitch")
+    obs, state = env.reset(key, params)
+    obs, state, reward, terminated, truncated, info = env.step(key, state, r_tilde, params)
+
+The action is r~ itself, in the plant's unit. One environment is unbatched; vmap for many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxouter.loop import rewards, sensor
+from jaxouter.loop.observation import Memory, Observer
+from jaxouter.loop.references import Goal, SetPoint
+from jaxouter.plants import Plant
+from jaxouter.plants import make as make_plant
+
+
+@struct.dataclass
+class EnvParams:
+    """Everything that may be swept without recompiling."""
+
+    plant: Any
+    sensor: sensor.SensorParams
+    reward: rewards.RewardParams
+
+
+class EnvState(NamedTuple):
+    """State of one environment at t_k."""
+
+    plant: Any
+    plant_params: Any  # drawn at reset; None where the plant draws none
+    goal: Any
+    memory: Memory  # of the outer loop, e_k integrated
+    r: jax.Array  # reference r_k
+    y: jax.Array  # true output y_k
+    y_seen: jax.Array  # measured output
+    count: jax.Array  # int32, k
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A plant, a goal generator and what the agent sees of them. Static and hashable."""
+
+    plant: Plant
+    observer: Observer
+    goal: Goal
+
+    def reset(self, key: chex.PRNGKey, params: EnvParams) -> tuple[jax.Array, EnvState]:
+        """A new episode: parameters, start and reference are drawn.
+
+        Returns:
+            obs (3 + 2H,) and the state.
+        """
+        key_draw, key_start, key_goal, key_sensor = jax.random.split(key, 4)
+        drawn = None if self.plant.draw is None else self.plant.draw(key_draw, params.plant)
+        plant_params = params.plant if drawn is None else drawn
+        state = self.plant.training_start(key_start, plant_params)
+        y = self.plant.output(plant_params, state)
+        y_seen = sensor.measure(params.sensor, key_sensor, y, y)
+        goal, r = self.goal.init(key_goal, y_seen)
+        memory, obs = self.observer.observe(self.observer.init(r, y_seen), r, y_seen)
+        return obs, EnvState(state, drawn, goal, memory, r, y, y_seen, jnp.zeros((), jnp.int32))
+
+    def step_env(
+        self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """One control step, without reset.
+
+        Args:
+            key: randomness of plant and sensor.
+            state: at t_k.
+            action: r~_k, scalar, clipped to its bounds.
+            params: traced parameters.
+
+        Returns:
+            obs, state, reward, terminated (y diverged), truncated (the episode's length is reached), and info with
+            `final_observation` (obs before any reset), `r` and `y` (the reference and measured output in it).
+        """
+        chex.assert_rank(action, 0)
+        plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
+        key_plant, key_sensor = jax.random.split(key)
+        r_tilde = jnp.clip(action, *plant.r_tilde_bounds)
+        plant_state = plant.step(p, state.plant, r_tilde, key_plant)
+        y = plant.output(p, plant_state)
+
+        low, high = plant.divergence_bounds
+        terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
+        truncated = state.count + 1 >= plant.episode_steps
+        y = jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y)
+        reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, state.memory.r_tilde_past[0])
+        reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
+
+        y_seen = sensor.measure(params.sensor, key_sensor, y, state.y_seen)
+        goal, r = self.goal.step(state.goal, y_seen)
+        memory = self.observer.record(state.memory, state.y_seen, r_tilde)
+        memory, obs = self.observer.observe(memory, r, y_seen)
+        state = EnvState(plant_state, state.plant_params, goal, memory, r, y, y_seen, state.count + 1)
+        return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": y_seen}
+
+    def step(
+        self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """One control step; where the episode ends, obs and state are those of a new one.
+
+        The observation that ended it is `info["final_observation"]`: bootstrap from it unless terminated.
+        """
+        key_step, key_reset = jax.random.split(key)
+        obs, after, reward, terminated, truncated, info = self.step_env(key_step, state, action, params)
+        new_obs, new = self.reset(key_reset, params)
+        done = terminated | truncated
+        obs, after = jax.tree.map(lambda a, b: jnp.where(done, a, b), (new_obs, new), (obs, after))
+        return obs, after, reward, terminated, truncated, info
+
+
+def make(
+    name: str,
+    *,
+    history: int | None = None,
+    integral_steps: float | None = None,
+    goal: Goal | None = None,
+    **overrides: Any,
+) -> tuple[Environment, EnvParams]:
+    """An environment on the training distribution, and its parameters.
+
+    Args:
+        name: plant, see `jaxouter.plants.make`.
+        history, integral_steps: of the observation, see `Observer.of`.
+        goal: reference generator; None: one set-point an episode, as in the paper.
+        **overrides: parameters of the plant.
+    """
+    plant, plant_params = make_plant(name, **overrides)
+    goal = SetPoint(*plant.setpoint_range) if goal is None else goal
+    env = Environment(plant, Observer.of(plant, history, integral_steps), goal)
+    return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant))

@@ -1,0 +1,118 @@
+"""What the agent sees: present and past r, y, r~ and functions of them, nothing else (spec section 1).
+
+The same functions serve the environment, the policy and the replay, which stores signals and builds observations from
+windows of them: what is not in `Signals` cannot reach the agent or the critic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.plants import Plant
+
+
+class Memory(NamedTuple):
+    """What an outer loop remembers between two control steps."""
+
+    y_past: jax.Array  # (H,), y_(k-1), y_(k-2), ...
+    r_tilde_past: jax.Array  # (H,), r~_(k-1), r~_(k-2), ...
+    integral: jax.Array  # leaky integral of r - y, a running mean over `integral_time`
+
+
+class Signals(NamedTuple):
+    """One control step as the replay stores it; each (W,) in a window, oldest first."""
+
+    r: jax.Array
+    y: jax.Array
+    integral: jax.Array
+    r_tilde: jax.Array
+    age: jax.Array  # control steps since the reset
+    r_next: jax.Array
+    y_next: jax.Array
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Builds observations, scaled by fixed physical units. Static and hashable."""
+
+    history: int
+    """H, past samples of y and of r~."""
+    integral_steps: float
+    """Time constant of the leaky integral, in control steps."""
+    y_middle: float
+    y_scale: float
+    r_tilde_bounds: tuple[float, float]
+
+    @classmethod
+    def of(cls, plant: Plant, history: int | None = None, integral_steps: float | None = None) -> Observer:
+        """The observer of a plant; None: the plant's history, a quarter of an episode.
+
+        Raises:
+            ValueError: history below 1 or integral_steps below 1.
+        """
+        history = plant.history if history is None else history
+        integral_steps = plant.episode_steps / 4 if integral_steps is None else integral_steps
+        if history < 1 or integral_steps < 1:
+            raise ValueError(f"history is {history} and integral_steps is {integral_steps}; both must be at least 1")
+        low, high = plant.setpoint_range
+        return cls(history, integral_steps, (low + high) / 2, (high - low) / 2, plant.r_tilde_bounds)
+
+    @property
+    def size(self) -> int:
+        """Length of the observation."""
+        return 3 + 2 * self.history
+
+    def init(self, r0: jax.Array, y0: jax.Array) -> Memory:
+        """Memory before t_0: histories filled with y_0 and r~_(-1), which is y_0 clipped to the bounds of r~."""
+        del r0  # only the present r is seen
+        before = jnp.clip(y0, *self.r_tilde_bounds)
+        return Memory(jnp.full(self.history, y0), jnp.full(self.history, before), jnp.zeros_like(y0))
+
+    def observe(self, memory: Memory, r: jax.Array, y: jax.Array) -> tuple[Memory, jax.Array]:
+        """At t_k: memory with r_k - y_k integrated, and the observation (3 + 2H,)."""
+        memory = memory._replace(integral=memory.integral + (r - y - memory.integral) / self.integral_steps)
+        return memory, self.features(memory, r, y)
+
+    def record(self, memory: Memory, y: jax.Array, r_tilde: jax.Array) -> Memory:
+        """After r~_k is chosen: y_k and r~_k become past."""
+        return memory._replace(
+            y_past=jnp.concatenate([y[None], memory.y_past[:-1]]),
+            r_tilde_past=jnp.concatenate([r_tilde[None], memory.r_tilde_past[:-1]]),
+        )
+
+    def features(self, memory: Memory, r: jax.Array, y: jax.Array) -> jax.Array:
+        """[r, r - y, leaky integral, past y minus y, past r~], scaled; (3 + 2H,)."""
+        chex.assert_rank([r, y], 0)
+        low, high = self.r_tilde_bounds
+        present = jnp.stack([r - self.y_middle, r - y, memory.integral]) / self.y_scale
+        y_past = (memory.y_past - y) / self.y_scale
+        r_tilde_past = (memory.r_tilde_past - (low + high) / 2) / ((high - low) / 2)
+        return jnp.concatenate([present, y_past, r_tilde_past])
+
+    def memory_at(self, window: Signals, i: jax.Array | int) -> Memory:
+        """Memory at t_i (its error integrated) from a window that starts at least H steps before step i.
+
+        Args:
+            window: Signals of (W,) consecutive steps of one environment; a reset may lie among those before i.
+            i: index in the window, H <= i < W.
+        """
+        back = jnp.arange(1, self.history + 1)
+        age = window.age[i].astype(back.dtype)
+        y0 = window.y[jnp.maximum(i - age, 0)]
+        within = back <= age
+        return Memory(
+            jnp.where(within, window.y[i - back], y0),
+            jnp.where(within, window.r_tilde[i - back], jnp.clip(y0, *self.r_tilde_bounds)),
+            window.integral[i],
+        )
+
+    def before_and_after(self, window: Signals, i: jax.Array | int, j: jax.Array | int) -> tuple[jax.Array, jax.Array]:
+        """Observation at t_i, and at t_(j+1) from what followed step j >= i (before any reset); each (3 + 2H,)."""
+        at_i = self.features(self.memory_at(window, i), window.r[i], window.y[i])
+        memory = self.record(self.memory_at(window, j), window.y[j], window.r_tilde[j])
+        return at_i, self.observe(memory, window.r_next[j], window.y_next[j])[1]

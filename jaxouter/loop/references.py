@@ -1,0 +1,168 @@
+"""References: families of whole trajectories, and goal generators that an environment asks step by step.
+
+A family is a pure function `family(key, steps, low, high) -> r`, r of shape (steps,) within [low, high]. A goal
+generator is `init(key, y0) -> (state, r0)` and `step(state, y) -> (state, r)`: the next reference may depend on what the
+plant does (paper section II: 'a human operator that interacts with the observed state').
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import chex
+import jax
+import jax.numpy as jnp
+
+SEGMENTS = 5  # set-points of a staircase, slopes of a ramp
+
+
+def _time(steps: int) -> jax.Array:
+    return jnp.arange(steps, dtype=float) / steps  # 0 to 1
+
+
+def constant(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """One set-point from the start on."""
+    return jnp.full(steps, jax.random.uniform(key, (), float, low, high))
+
+
+def staircase(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """Five set-points, each held equally long."""
+    levels = jax.random.uniform(key, (SEGMENTS,), float, low, high)
+    return levels[jnp.arange(steps) * SEGMENTS // steps]
+
+
+def ramps(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """Five straight lines through random knots, without jumps."""
+    knots = jax.random.uniform(key, (SEGMENTS + 1,), float, low, high)
+    return jnp.interp(_time(steps) * SEGMENTS, jnp.arange(SEGMENTS + 1.0), knots)
+
+
+def sines(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """A sine about the middle: a quarter to all of the range, 3 to 12 periods."""
+    amplitude, cycles = jax.random.uniform(key, (2,), float, jnp.array([0.25, 3.0]), jnp.array([1.0, 12.0]))
+    wave = jnp.sin(2 * jnp.pi * cycles * _time(steps))
+    return (low + high) / 2 + amplitude * (high - low) / 2 * wave
+
+
+def doublets(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """Middle, up, down, middle: a quarter to all of the range, each pulse an eighth to a quarter of the time."""
+    amplitude, width = jax.random.uniform(key, (2,), float, jnp.array([0.25, 0.125]), jnp.array([1.0, 0.25]))
+    sign = jax.random.rademacher(jax.random.fold_in(key, 1), (), float)
+    phase = (_time(steps) - 0.125) / width  # pulses on [0, 1) and [1, 2)
+    pulse = jnp.where((phase >= 0) & (phase < 1), 1.0, 0.0) - jnp.where((phase >= 1) & (phase < 2), 1.0, 0.0)
+    return (low + high) / 2 + sign * amplitude * (high - low) / 2 * pulse
+
+
+def days(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """Night set-back: 16 steps warm, 8 steps cool, of 24 a day, starting at a random hour."""
+    key_levels, key_hour = jax.random.split(key)
+    share = jax.random.uniform(key_levels, (2,), float)
+    warm, cool = (low + high) / 2 + (high - low) / 2 * share * jnp.array([1.0, -1.0])
+    hour = (jnp.arange(steps) + jax.random.randint(key_hour, (), 0, 24)) % 24
+    return jnp.where((hour >= 6) & (hour < 22), warm, cool)
+
+
+FAMILIES: dict[str, Callable[[chex.PRNGKey, int, float, float], jax.Array]] = {
+    "steps": constant,
+    "staircase": staircase,
+    "ramps": ramps,
+    "sines": sines,
+    "doublets": doublets,
+    "days": days,
+}
+
+
+class Goal(Protocol):
+    """A goal generator."""
+
+    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[Any, jax.Array]:
+        """State and the first reference."""
+        ...
+
+    def step(self, state: Any, y: jax.Array) -> tuple[Any, jax.Array]:
+        """State and the next reference, after the plant gave y."""
+        ...
+
+
+class SetPointState(NamedTuple):
+    """State of the set-point generators."""
+
+    key: chex.PRNGKey
+    r: jax.Array
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """A set-point uniform in [low, high], redrawn at each step with a probability (0: one an episode, the paper)."""
+
+    low: float
+    high: float
+    redraw: float = 0.0
+
+    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[SetPointState, jax.Array]:
+        """A first set-point, whatever y0."""
+        del y0
+        key, draw = jax.random.split(key)
+        r = jax.random.uniform(draw, (), float, self.low, self.high)
+        return SetPointState(key, r), r
+
+    def step(self, state: SetPointState, y: jax.Array) -> tuple[SetPointState, jax.Array]:
+        """The same set-point, or with probability `redraw` another."""
+        del y
+        if self.redraw == 0.0:
+            return state, state.r
+        key, when, draw = jax.random.split(state.key, 3)
+        other = jax.random.uniform(draw, (), float, self.low, self.high)
+        r = jnp.where(jax.random.uniform(when, (), float) < self.redraw, other, state.r)
+        return SetPointState(key, r), r
+
+
+@dataclass(frozen=True)
+class Reaimed:
+    """A human who re-aims: a new set-point in [low, high] as soon as y is within `tolerance` of the present one."""
+
+    low: float
+    high: float
+    tolerance: float
+
+    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[SetPointState, jax.Array]:
+        """A first set-point."""
+        return SetPoint(self.low, self.high).init(key, y0)
+
+    def step(self, state: SetPointState, y: jax.Array) -> tuple[SetPointState, jax.Array]:
+        """The same set-point until y is near it."""
+        key, draw = jax.random.split(state.key)
+        other = jax.random.uniform(draw, (), float, self.low, self.high)
+        r = jnp.where(jnp.abs(state.r - y) < self.tolerance, other, state.r)
+        return SetPointState(key, r), r
+
+
+class FamilyState(NamedTuple):
+    """State of `Family`."""
+
+    r: jax.Array  # (steps,)
+    count: jax.Array  # int32
+
+
+@dataclass(frozen=True)
+class Family:
+    """A trajectory of one of `FAMILIES`, drawn at each reset; its last value is held."""
+
+    kind: str
+    steps: int
+    low: float
+    high: float
+
+    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[FamilyState, jax.Array]:
+        """A trajectory and its first value."""
+        del y0
+        r = FAMILIES[self.kind](key, self.steps, self.low, self.high)
+        return FamilyState(r, jnp.zeros((), jnp.int32)), r[0]
+
+    def step(self, state: FamilyState, y: jax.Array) -> tuple[FamilyState, jax.Array]:
+        """The next value."""
+        del y
+        count = jnp.minimum(state.count + 1, self.steps - 1)
+        return FamilyState(state.r, count), state.r[count]

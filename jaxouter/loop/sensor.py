@@ -1,0 +1,35 @@
+"""The sensor between y and whoever looks at it. Metrics and rewards use the true y."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class SensorParams:
+    """Traced; the default is a perfect sensor."""
+
+    noise: jax.Array  # standard deviation, in the unit of y
+    bias: jax.Array  # in the unit of y
+    missing: jax.Array  # probability that a sample is lost; the last one then stands
+
+
+def params(noise: float = 0.0, bias: float = 0.0, missing: float = 0.0) -> SensorParams:
+    """Sensor parameters from plain numbers.
+
+    Raises:
+        ValueError: noise is negative or missing is not a probability.
+    """
+    if noise < 0 or not 0 <= missing <= 1:
+        raise ValueError(f"noise is {noise} and missing is {missing}; noise must be >= 0, missing in [0, 1]")
+    return SensorParams(*(jnp.asarray(value, float) for value in (noise, bias, missing)))
+
+
+def measure(p: SensorParams, key: chex.PRNGKey, y: jax.Array, last: jax.Array) -> jax.Array:
+    """What is seen of y (scalar), when `last` was seen before."""
+    key_noise, key_missing = jax.random.split(key)
+    seen = y + p.bias + p.noise * jax.random.normal(key_noise, (), y.dtype)
+    return jnp.where(jax.random.uniform(key_missing, (), y.dtype) < p.missing, last, seen)

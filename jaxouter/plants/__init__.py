@@ -1,0 +1,79 @@
+"""The plants: physics only, nothing of learning. A new plant is one file and one line in `REGISTRY`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+
+from jaxouter.plants import heaters, pitch
+from jaxouter.plants.base import Plant
+
+__all__ = ["REGISTRY", "Plant", "make", "resolve", "simulate"]
+
+REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
+
+
+def resolve(name: str) -> Callable[..., tuple[Plant, Any]]:
+    """The `make` function of the plant called `name`.
+
+    Raises:
+        ValueError: there is no such plant; lists those that exist.
+    """
+    if name not in REGISTRY:
+        raise ValueError(f"there is no plant {name!r}; the plants are: {', '.join(REGISTRY)}")
+    return REGISTRY[name]
+
+
+def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
+    """A plant and its parameters, by name: `plant, params = make("pitch", tau=0.5, d1=0.57)`.
+
+    Args:
+        name: `pitch` or `heaters` (or whatever stands in `REGISTRY`).
+        **overrides: keyword arguments of the plant's own `make`, such as `jaxouter.plants.pitch.make`.
+
+    Raises:
+        ValueError: unknown plant or override (lists what exists), or a value that does not fit.
+    """
+    maker = resolve(name)
+    known = list(inspect.signature(maker).parameters)
+    unknown = [key for key in overrides if key not in known]
+    if unknown:
+        raise ValueError(f"plant {name!r} has no parameter {', '.join(unknown)}; it has: {', '.join(known)}")
+    return maker(**overrides)
+
+
+@partial(jax.jit, static_argnums=0)
+def _simulate(plant: Plant, params: Any, state: Any, r_tilde: jax.Array, key: chex.PRNGKey) -> jax.Array:
+    def step(state: Any, inputs: tuple[jax.Array, chex.PRNGKey]) -> tuple[Any, jax.Array]:
+        state = plant.step(params, state, *inputs)
+        return state, plant.output(params, state)
+
+    return jax.lax.scan(step, state, (r_tilde, jax.random.split(key, r_tilde.shape[0])))[1]
+
+
+def simulate(plant: Plant, params: Any, r_tilde: Any, key: chex.PRNGKey, state: Any = None) -> jax.Array:
+    """Run the plant alone on a sequence of modified references.
+
+    Args:
+        plant, params: as `make` returns them.
+        r_tilde: (T,), in the plant's unit, each held for one control step.
+        key: randomness of start and noise.
+        state: where to begin; None: from rest (heaters: from the given temperatures).
+
+    Returns:
+        y (T,), the output after each control step.
+
+    Raises:
+        ValueError: r_tilde is not a sequence of numbers.
+    """
+    r_tilde = jax.numpy.asarray(r_tilde, dtype=float)
+    if r_tilde.ndim != 1:
+        raise ValueError(f"r_tilde has shape {r_tilde.shape}; it must be one sequence, of shape (T,)")
+    key_start, key_noise = jax.random.split(key)
+    state = plant.init(key_start, params) if state is None else state
+    return _simulate(plant, params, state, r_tilde, key_noise)

@@ -1,0 +1,86 @@
+"""What a plant is: three pure functions on one unbatched plant, and a declaration from which the rest derives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A plant with its inner loop, seen from outside: r~ goes in, y comes out.
+
+    The functions are pure and work on one unbatched plant; callers vmap. Parameters and state are pytrees, parameters
+    are always traced. Rewards, observation scaling and scenario families derive from the declared numbers.
+    """
+
+    name: str
+    init: Callable[[chex.PRNGKey, Any], Any]
+    """`init(key, params) -> state`: the plant at rest (heaters: at the given temperatures)."""
+    step: Callable[[Any, Any, jax.Array, chex.PRNGKey], Any]
+    """`step(params, state, r_tilde, key) -> state`: one control step with r~ (scalar) held."""
+    output: Callable[[Any, Any], jax.Array]
+    """`output(params, state) -> y`, scalar."""
+
+    y_unit: str
+    time_unit: str
+    control_step: float
+    """Length of one control step, in `time_unit`."""
+    episode_steps: int
+    r_tilde_bounds: tuple[float, float]
+    """Least and largest r~, in `y_unit`."""
+    setpoint_range: tuple[float, float]
+    """Set-points of the training distribution (spec section 5)."""
+    evaluation_range: tuple[float, float]
+    """Set-points of the evaluation families (spec section 6)."""
+    divergence_bounds: tuple[float, float]
+    """Training ends an episode when y leaves these."""
+    output_limit: float | None = None
+    """|y| must not exceed this (the paper's L on pitch)."""
+    rate_limit: float | None = None
+    """|y_(k+1) - y_k| must not exceed this (the paper's L on heaters)."""
+    move_threshold: float | None = None
+    """Moves of r~ and of y of at least this size are charged (the paper's rho_h and rho_b)."""
+    history: int = 15
+    """Default number of past samples of y and r~ in the observation."""
+    families: tuple[str, ...] = ("steps", "staircase", "ramps")
+    """Reference families of the evaluation, by the names of `jaxouter.loop.references`."""
+    family_steps: int = 600
+    """Length of a family member in control steps (`steps`: one episode)."""
+
+    start: Callable[[chex.PRNGKey, Any], Any] | None = None
+    """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
+    draw: Callable[[chex.PRNGKey, Any], Any] | None = None
+    """`draw(key, params) -> params`: parameters of one training episode (domain randomisation); None: the given ones."""
+    members: Callable[[Any, Any], jax.Array] | None = None
+    """`members(params, state) -> (n,)`: the single outputs of which y is a weighted mean; None: y is all there is."""
+
+    def __post_init__(self) -> None:
+        for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):
+            low, high = getattr(self, field)
+            if not low < high:
+                raise ValueError(f"plant {self.name!r}: {field} is {(low, high)}; the first must be below the second")
+        if self.control_step <= 0 or self.episode_steps < 1:
+            raise ValueError(f"plant {self.name!r}: control_step and episode_steps must be positive")
+
+    def training_start(self, key: chex.PRNGKey, params: Any) -> Any:
+        """State at the start of a training episode."""
+        return (self.start or self.init)(key, params)
+
+
+def array(name: str, value: Any, *shapes: tuple[int, ...]) -> jax.Array:
+    """`value` as float array (float32, or float64 under x64) of one of `shapes`.
+
+    Raises:
+        ValueError: names the field, the shape got and the shapes allowed.
+    """
+    out = jnp.asarray(value, dtype=float)
+    if out.shape not in shapes:
+        allowed = " or ".join("a number" if not s else f"an array of shape {s}" for s in shapes)
+        raise ValueError(f"{name} has shape {out.shape}; it must be {allowed}")
+    return out

@@ -1,0 +1,201 @@
+"""Electric space heaters as a mean field (paper section IV).
+
+Units: temperatures in degC, time in h, Ca in kWh/degC, Ua in kW/degC. The houses are a vmapped axis; any parameter of a
+house may be one number for all or an array (n,).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxouter.plants.base import Plant, array
+
+CONTROL_STEP = 1.0  # h
+UFree = Literal["printed", "physical"]
+
+
+@struct.dataclass
+class HouseParams:
+    """One house and its local law; each a number or (n,). Symbols are the paper's."""
+
+    Ca: jax.Array  # thermal mass of the air, kWh/degC
+    Ua: jax.Array  # conductance to outside, kW/degC
+    x_out: jax.Array  # outside temperature, degC
+    sigma: jax.Array  # volatility, degC/sqrt(h)
+    Pi: jax.Array  # feedback of the local law (the paper's Pi_a)
+    r_u: jax.Array  # control weight (the paper's r)
+    phi: jax.Array  # discount of the local law, 1/h (the paper's phi, 'delta' in its numbers)
+    gamma: jax.Array  # weight of the mean field
+    beta2: jax.Array  # 1/h (printed as beta_1)
+    lambda1: jax.Array  # 1/h
+    gain: jax.Array  # multiplies u
+    disturbance: jax.Array  # added to u, kW
+
+
+@struct.dataclass
+class HeatersParams:
+    """Parameters of the population; every array is traced, the number of houses is a shape."""
+
+    house: HouseParams
+    x0_mean: jax.Array  # mean temperature at the start, degC; a number or (n,)
+    x0_spread: jax.Array  # houses start at x0_mean plus or minus this, degC
+    weights: jax.Array  # (n,), y = sum of weights times temperatures
+    u_free: UFree = struct.field(pytree_node=False)
+    substeps: int = struct.field(pytree_node=False)  # Euler-Maruyama steps an hour
+
+
+class HeatersState(NamedTuple):
+    """State of the population."""
+
+    x: jax.Array  # (n,), air temperatures, degC
+    x0: jax.Array  # (n,), temperatures at the start of the episode, degC
+    count: jax.Array  # int32, hours since the start of the episode
+
+
+def make(
+    *,
+    n: int = 4,
+    x0_mean: Any = 19.25,
+    x0_spread: float = 1.0,
+    Ca: Any = 10.0,
+    Ua: Any = 0.2,
+    x_out: Any = -5.0,
+    sigma: Any = 0.25,
+    Pi: Any = 0.4,
+    r_u: Any = 10.0,
+    phi: Any = 0.001,
+    gamma: Any = 0.6,
+    beta2: Any = 0.038,
+    lambda1: Any = -0.028,
+    gain: Any = 1.0,
+    disturbance: Any = 0.0,
+    weights: Any = None,
+    u_free: UFree = "printed",
+    substeps: int = 10,
+) -> tuple[Plant, HeatersParams]:
+    """The space heaters and their parameters.
+
+    Args:
+        n: number of houses.
+        x0_mean, x0_spread: houses start at x0_mean + U(-1, 1) x0_spread, recentred to the exact mean, degC.
+        Ca, Ua, x_out, sigma, Pi, r_u, phi, gamma, beta2, lambda1: house and local law, see `HouseParams`; each one
+            number for all houses or an array (n,). Pi = 0.4 is the poor law of the paper, 17.186 the Riccati root.
+        gain, disturbance: multiplies u; added to u, kW.
+        weights: (n,), of the mean that is y; None: 1/n each.
+        u_free: 'printed' is the paper's -(Ua/Ca)(x_out - x0); 'physical' the power that holds x0, Ua (x0 - x_out),
+            only with Pi >= 17 (with a small Pi no r~ >= 0 could then reach 15 degC).
+        substeps: Euler-Maruyama steps an hour.
+
+    Raises:
+        ValueError: a shape is wrong, n or substeps is not positive, or u_free does not fit.
+    """
+    if n < 1 or substeps < 1:
+        raise ValueError(f"n is {n} and substeps is {substeps}; both must be at least 1")
+    if u_free not in get_args(UFree):
+        raise ValueError(f"u_free is {u_free!r}; it must be one of {', '.join(get_args(UFree))}")
+    per_house = dict(
+        Ca=Ca, Ua=Ua, x_out=x_out, sigma=sigma, Pi=Pi, r_u=r_u, phi=phi, gamma=gamma, beta2=beta2, lambda1=lambda1
+    )
+    per_house |= dict(gain=gain, disturbance=disturbance)
+    house = HouseParams(**{name: array(name, value, (), (n,)) for name, value in per_house.items()})
+    if u_free == "physical" and float(jnp.min(house.Pi)) < 17.0:
+        raise ValueError(f"u_free 'physical' goes with Pi = 17.186 only; Pi is {Pi} (then no r~ >= 0 reaches 15 degC)")
+    params = HeatersParams(
+        house=house,
+        x0_mean=array("x0_mean", x0_mean, (), (n,)),
+        x0_spread=array("x0_spread", x0_spread, ()),
+        weights=jnp.full(n, 1.0 / n) if weights is None else array("weights", weights, (n,)),
+        u_free=u_free,
+        substeps=substeps,
+    )
+    return HEATERS, params
+
+
+def init(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
+    """The houses at their given temperatures: x0_mean + U(-1, 1) x0_spread, recentred so that y is exact."""
+    offsets = jax.random.uniform(key, params.weights.shape, params.weights.dtype, -1.0, 1.0) * params.x0_spread
+    centre = jnp.sum(params.weights * offsets) / jnp.sum(params.weights)
+    return _state(params.x0_mean + (offsets - centre))
+
+
+def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
+    """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it (spec section 5)."""
+    key_mean, key_house = jax.random.split(key)
+    mean = jax.random.uniform(key_mean, (), params.weights.dtype, 15.0, 25.0)
+    return _state(mean + jax.random.uniform(key_house, params.weights.shape, params.weights.dtype, -1.0, 1.0))
+
+
+def _state(x0: jax.Array) -> HeatersState:
+    return HeatersState(x=x0, x0=x0, count=jnp.zeros((), jnp.int32))
+
+
+def output(params: HeatersParams, state: HeatersState) -> jax.Array:
+    """y, the weighted mean of the temperatures, degC."""
+    return jnp.sum(params.weights * state.x)
+
+
+def members(params: HeatersParams, state: HeatersState) -> jax.Array:
+    """Temperatures of the single houses (n,), degC."""
+    del params
+    return state.x
+
+
+def drift(p: HouseParams, x: jax.Array, x0: jax.Array, t: jax.Array, r_tilde: jax.Array, u_free: UFree) -> jax.Array:
+    """Deterministic part of dx/dt of one house under its local law, degC/h; all arguments scalar.
+
+    Source: paper section IV, x* = r~ in both terms; spec section 3.
+    """
+    chex.assert_rank([x, x0, t, r_tilde], 0)
+    s_inf = r_tilde / (-p.Ua / p.Ca - p.Pi / (p.Ca**2 * p.r_u) - p.phi)
+    s = s_inf + p.gamma / (p.beta2 - p.lambda1) * (r_tilde - x0) * jnp.exp(p.lambda1 * t)
+    u = p.gain * -(p.Pi * x + s) / (p.Ca * p.r_u) + p.disturbance
+    hold = p.Ua * (x0 - p.x_out)  # power that holds x0
+    u_free_power = hold / p.Ca if u_free == "printed" else hold
+    return (-p.Ua * (x - p.x_out) + u + u_free_power) / p.Ca
+
+
+def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: chex.PRNGKey) -> HeatersState:
+    """One hour with r~ (scalar, degC) held: Euler-Maruyama, one Wiener process a house."""
+    chex.assert_rank([state.x, r_tilde], [1, 0])
+    h = CONTROL_STEP / params.substeps
+    house_axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, params.house)
+    noise = jax.random.normal(key, (params.substeps, *state.x.shape), state.x.dtype)
+
+    def euler_maruyama(p, x, x0, t, w):
+        return x + h * drift(p, x, x0, t, r_tilde, params.u_free) + p.sigma * h**0.5 * w
+
+    def inner(x: jax.Array, i_and_w: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        i, w = i_and_w
+        t = state.count.astype(x.dtype) * CONTROL_STEP + i * h
+        return jax.vmap(euler_maruyama, (house_axes, 0, 0, None, 0))(params.house, x, state.x0, t, w), None
+
+    x, _ = jax.lax.scan(inner, state.x, (jnp.arange(params.substeps, dtype=state.x.dtype), noise))
+    return HeatersState(x, state.x0, state.count + 1)
+
+
+HEATERS = Plant(
+    name="heaters",
+    init=init,
+    step=step,
+    output=output,
+    start=start,
+    members=members,
+    y_unit="degC",
+    time_unit="h",
+    control_step=CONTROL_STEP,
+    episode_steps=200,
+    r_tilde_bounds=(0.0, 40.0),
+    setpoint_range=(15.0, 25.0),
+    evaluation_range=(15.0, 25.0),
+    divergence_bounds=(-20.0, 60.0),
+    rate_limit=1.0,
+    move_threshold=1.0,
+    history=5,
+    families=("steps", "staircase", "ramps", "days"),
+    family_steps=200,
+)

@@ -1,0 +1,248 @@
+"""Boeing 747 pitch control with a delayed human pilot (paper section III).
+
+Units: x1 = u, x2 = w in ft/s, x3 = q in crad/s, x4 = theta in crad (1 crad = 0.01 rad), time in s. A, B: Bryson, 747 at
+40 kft and 774 ft/s. The paper's 'Neal-Schmidt' pilot is the Neal-Smith one, 0.5 (s+1)/(5s+1) exp(-tau s).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from flax import struct
+
+from jaxouter.plants import delay
+from jaxouter.plants.base import Plant, array
+
+CONTROL_STEP = 0.1  # s
+START_SPREAD = (1.0, 1.0, 0.5, 5.0)  # training starts are uniform in plus or minus this (spec section 5)
+
+A_747 = (
+    (-0.003, 0.039, 0.0, -0.322),
+    (-0.065, -0.319, 7.740, 0.0),
+    (0.020, -0.101, -0.429, 0.0),
+    (0.0, 0.0, 1.0, 0.0),
+)
+B_747 = (0.010, -0.180, -1.160, 0.0)
+W_PRINTED = (0.1, 0.3, -0.3)
+
+
+@struct.dataclass
+class PitchParams:
+    """Parameters of the pitch plant; every array is traced. Symbols are the paper's."""
+
+    tau: jax.Array  # delay of the pilot, s
+    d1: jax.Array  # delay of x in the controller, s
+    d2: jax.Array  # delay of xc in the controller, s
+    W: jax.Array  # (3,), uncertainty delta(x) = W' [1, x1, x2]
+    A: jax.Array  # (4, 4)
+    B: jax.Array  # (4,)
+    A_h: jax.Array  # pilot, 1/s
+    B_h: jax.Array
+    C_h: jax.Array
+    D_h: jax.Array
+    K1: jax.Array  # (4,), gain on x
+    K2: jax.Array  # gain on xc
+    gain: jax.Array  # multiplies u
+    disturbance: jax.Array  # added to u, crad
+    max_delay: float = struct.field(pytree_node=False)  # s; static: sets the length of the delay lines
+    substeps: int = struct.field(pytree_node=False)  # inner steps a control step
+
+
+class PitchState(NamedTuple):
+    """State of the pitch plant; all zero at rest."""
+
+    x: jax.Array  # (4,), [u ft/s, w ft/s, q crad/s, theta crad]
+    xc: jax.Array  # integral of theta - c, crad s
+    xi: jax.Array  # pilot
+    lines: jax.Array  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step
+    r_tilde_line: jax.Array  # (M,), delay line of r~, a sample a control step
+    count: jax.Array  # int32, control steps since the start
+
+
+def lqr(A: Any, B: Any, Q: Any, R: float) -> tuple[np.ndarray, float]:
+    """Gains of the paper's controller: LQR on [x; xc] with xc' = x4 (the pilot left out).
+
+    Returns:
+        K1 (4,) and K2, of u = -K1 x - K2 xc.
+
+    Source: paper section III-A and its table; spec section 2.
+    """
+    A, B = np.asarray(A, float), np.asarray(B, float)
+    augmented = np.zeros((5, 5))
+    augmented[:4, :4] = A
+    augmented[4, 3] = 1.0
+    column = np.append(B, 0.0)[:, None]
+    P = scipy.linalg.solve_continuous_are(augmented, column, np.diag(Q), [[R]])
+    K = (column.T @ P)[0] / R
+    return K[:4], float(K[4])
+
+
+def make(
+    *,
+    tau: float = 0.5,
+    d1: float = 0.0,
+    d2: float = 0.0,
+    W: Sequence[float] = (0.1, 0.003, -0.003),
+    A: Any = A_747,
+    B: Any = B_747,
+    A_h: float = -0.2,
+    B_h: float = 1.0,
+    C_h: float = 0.08,
+    D_h: float = 0.1,
+    Q: Sequence[float] = (0.0, 0.0, 0.0, 1.0, 2.5),
+    R: float = 10.0,
+    K1: Sequence[float] | None = None,
+    K2: float | None = None,
+    gain: float = 1.0,
+    disturbance: float = 0.0,
+    max_delay: float | None = None,
+    substeps: int = 10,
+) -> tuple[Plant, PitchParams]:
+    """The pitch plant and its parameters.
+
+    Args:
+        tau, d1, d2: delays of pilot, state feedback and integral feedback, s; any real number in [0, max_delay].
+        W: uncertainty. The printed (0.1, 0.3, -0.3) makes the loop unstable; the default has x1, x2 in hundreds.
+        A, B, A_h, B_h, C_h, D_h: aircraft and pilot.
+        Q, R: weights of the LQR design, (5,) diagonal and a number; unused where K1 and K2 are given.
+        K1, K2: gains; None: the LQR gains of A, B, Q, R.
+        gain, disturbance: multiplies u; added to u, crad.
+        max_delay: longest delay the lines can hold, s; None: the smallest that serves.
+        substeps: inner steps a control step of 0.1 s; at least 10, so that none is longer than 0.01 s.
+
+    Raises:
+        ValueError: a delay is negative or above max_delay, a shape is wrong, or there are too few substeps.
+    """
+    longest = max(tau, d1, d2)
+    if max_delay is None:
+        max_delay = math.ceil(round(longest / CONTROL_STEP, 6)) * CONTROL_STEP
+    for name, value in (("tau", tau), ("d1", d1), ("d2", d2)):
+        if not 0.0 <= value <= max_delay:
+            raise ValueError(f"{name} is {value} s; a delay must lie in [0, max_delay] = [0, {max_delay:g}] s")
+    if substeps < 10:
+        raise ValueError(f"substeps is {substeps}; it must be at least 10 (an inner step of at most 0.01 s)")
+    if K1 is None or K2 is None:
+        designed = lqr(A, B, Q, R)
+        K1 = designed[0] if K1 is None else K1
+        K2 = designed[1] if K2 is None else K2
+    scalars = dict(
+        tau=tau, d1=d1, d2=d2, A_h=A_h, B_h=B_h, C_h=C_h, D_h=D_h, K2=K2, gain=gain, disturbance=disturbance
+    )
+    params = PitchParams(
+        **{name: array(name, value, ()) for name, value in scalars.items()},
+        W=array("W", W, (3,)),
+        A=array("A", A, (4, 4)),
+        B=array("B", B, (4,)),
+        K1=array("K1", K1, (4,)),
+        max_delay=max_delay,
+        substeps=substeps,
+    )
+    return PITCH, params
+
+
+def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
+    """Rest: everything zero."""
+    del key
+    zero = jnp.zeros(())
+    return PitchState(
+        x=jnp.zeros(4),
+        xc=zero,
+        xi=zero,
+        lines=jnp.zeros((3, delay.length(params.max_delay, CONTROL_STEP / params.substeps))),
+        r_tilde_line=jnp.zeros(delay.length(params.max_delay, CONTROL_STEP)),
+        count=jnp.zeros((), jnp.int32),
+    )
+
+
+def start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
+    """A training start: x uniform in plus or minus `START_SPREAD`, the rest as at rest."""
+    spread = jnp.asarray(START_SPREAD)
+    return init(key, params)._replace(x=jax.random.uniform(key, (4,), spread.dtype, -spread, spread))
+
+
+def output(params: PitchParams, state: PitchState) -> jax.Array:
+    """y = theta = x4, crad."""
+    del params
+    return state.x[3]
+
+
+def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.PRNGKey) -> PitchState:
+    """One control step of 0.1 s with r~ (scalar, crad) held.
+
+    The delay-free part is linear and propagated exactly; the delayed inputs are held over an inner step at their value
+    in its middle (r~: at its mean), which makes the whole second order. A delay outside [0, max_delay] gives NaN.
+
+    Source: paper section III; spec section 2.
+    """
+    del key
+    chex.assert_rank([state.x, r_tilde], [1, 0])
+    p, h = params, CONTROL_STEP / params.substeps
+    transition = _discretise(p, h)
+    delays = jnp.stack([p.tau, p.d1, p.d2])
+    lags = delays / h
+    held = jnp.all((delays >= 0.0) & (delays <= p.max_delay + 1e-6))
+    r_tilde_line = delay.write(state.r_tilde_line, state.count, r_tilde)
+
+    def inner(carry: tuple[jax.Array, jax.Array], i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
+        z, lines = carry
+        n = state.count * p.substeps + i
+        samples = jnp.stack([z[3], _dot(p.K1, z[:4]), p.K2 * z[4]])
+        lines = jax.vmap(delay.write, (0, None, 0))(lines, n, samples)
+        theta, k1x, k2xc = jax.vmap(delay.read, (0, None, 0))(lines, n, lags - 0.5)
+        theta_e = delay.read_held(r_tilde_line, n, lags[0], p.substeps) - theta
+        u = p.gain * -(k1x + k2xc) + p.disturbance + p.W[0]
+        return (_dot(transition, jnp.concatenate([z, jnp.stack([theta_e, u])])), lines), None
+
+    z = jnp.concatenate([state.x, jnp.stack([state.xc, state.xi])])
+    (z, lines), _ = jax.lax.scan(inner, (z, state.lines), jnp.arange(p.substeps, dtype=state.count.dtype), unroll=5)
+    z = jnp.where(held, z, jnp.nan)
+    return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.count + 1)
+
+
+def _discretise(p: PitchParams, h: float) -> jax.Array:
+    """(6, 8): [x; xc; xi] after an inner step of h, from [x; xc; xi; delayed theta_e; u + W1] at its start.
+
+    The exponential is summed to order 6, exact in double precision for ||F h|| < 0.1.
+    """
+    F = jnp.zeros((8, 8))
+    F = F.at[:4, :4].set(p.A + p.B[:, None] * jnp.stack([p.W[1], p.W[2], *jnp.zeros(2)])[None, :])
+    F = F.at[:4, 7].set(p.B)
+    F = F.at[4, 3].set(1.0).at[4, 5].set(-p.C_h).at[4, 6].set(-p.D_h)
+    F = F.at[5, 5].set(p.A_h).at[5, 6].set(p.B_h)
+    exponential = jnp.eye(8)
+    for order in range(6, 0, -1):
+        exponential = jnp.eye(8) + _dot(F, exponential) * (h / order)
+    return exponential[:6]
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.dot(a, b, precision=jax.lax.Precision.HIGHEST)  # accelerators would round the inputs
+
+
+PITCH = Plant(
+    name="pitch",
+    init=init,
+    step=step,
+    output=output,
+    start=start,
+    y_unit="crad",
+    time_unit="s",
+    control_step=CONTROL_STEP,
+    episode_steps=200,
+    r_tilde_bounds=(-60.0, 60.0),  # 3 * 18 = 54 would just hold y at the bound
+    setpoint_range=(-17.0, 17.0),
+    evaluation_range=(-16.0, 16.0),
+    divergence_bounds=(-60.0, 60.0),
+    output_limit=18.0,
+    move_threshold=3.5,
+    history=15,
+    families=("steps", "staircase", "ramps", "sines", "doublets"),
+    family_steps=600,
+)

@@ -1,0 +1,1 @@
+"""Training: configuration, the jitted pipeline, checkpoints, run folders."""

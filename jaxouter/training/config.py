@@ -1,0 +1,168 @@
+"""Configuration of a training run, and the presets."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from jaxouter import plants
+from jaxouter.agents.ddpg import DDPGConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run. Every field is an option of `python -m jaxouter.train`."""
+
+    plant: str
+    """Plant to learn on."""
+    preset: str
+    """The preset that gave the defaults."""
+    seed: int = 0
+    """Seed of the first run."""
+    seeds: int = 1
+    """Runs with consecutive seeds, trained side by side."""
+    steps: int = 200_000
+    """Environment steps in all, over all environments, prefill included."""
+    environments: int = 1
+    """Environments that roll out in parallel."""
+    updates: int = 1
+    """Gradient updates after each step of all environments; updates / environments is the update-to-data ratio."""
+    prefill: int = 1_000
+    """Environment steps of random held actions before the first update."""
+    replay: int = 1_000_000
+    """Environment steps that the replay holds."""
+    epoch: int = 2_000
+    """Environment steps an epoch, the unit of progress, evaluation and checkpoints."""
+    history: int | None = None
+    """Past samples of y and r~ in the observation; None: what the plant declares."""
+    integral_steps: float | None = None
+    """Time constant of the leaky integral, in control steps; None: a quarter of an episode."""
+    redraw: float = 0.0
+    """Probability at each control step that the set-point is redrawn within an episode."""
+    residual: bool = False
+    """Learn a correction of the static prefilter, identified first, instead of r~ itself."""
+    reward_scale: float = 1.0
+    """Multiplies the reward before it is learned from."""
+    noise_theta: float = 0.15
+    """Rate of return of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
+    noise_sigma: tuple[float, float] = (0.2, 0.2)
+    """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
+    noise_end: float = 1.0
+    """Factor on the volatility at the end of training, reached linearly."""
+    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
+    """The learner."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, naming field, value and what is allowed."""
+        plants.resolve(self.plant)
+        for name in ("seeds", "steps", "environments", "updates", "epoch", "reward_scale"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; it must not be negative")
+        for name in ("steps", "epoch", "prefill"):
+            if getattr(self, name) % self.environments:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}; it must be a multiple of the {self.environments} environments"
+                )
+        if not self.ddpg.batch_size <= self.prefill < self.steps:
+            raise ValueError(
+                f"prefill is {self.prefill}; it must lie between the batch size, {self.ddpg.batch_size}, "
+                f"and the {self.steps} steps"
+            )
+        if self.prefill < self.ddpg.n_step * self.environments:
+            raise ValueError(f"prefill is {self.prefill}; it must hold ddpg.n_step = {self.ddpg.n_step} steps of each")
+        if self.replay < self.ddpg.batch_size:
+            raise ValueError(f"replay is {self.replay}; it must hold at least a batch of {self.ddpg.batch_size}")
+        if not 0 <= self.redraw <= 1 or not 0 < self.noise_theta <= 1:
+            raise ValueError(
+                f"redraw is {self.redraw} and noise_theta is {self.noise_theta}; they must lie in [0, 1] and (0, 1]"
+            )
+        if min(self.noise_sigma) <= 0 or self.noise_end < 0:
+            raise ValueError(
+                f"noise_sigma is {self.noise_sigma} and noise_end is {self.noise_end}; "
+                "they must be positive and not negative"
+            )
+
+    @property
+    def epochs(self) -> int:
+        """Epochs after the prefill; the last one may be shorter."""
+        return -(-(self.steps - self.prefill) // self.epoch)
+
+    @property
+    def total_updates(self) -> int:
+        """Gradient updates of one seed."""
+        return (self.steps - self.prefill) // self.environments * self.updates
+
+
+PAPER = TrainConfig(plant="pitch", preset="paper")
+DEFAULT = TrainConfig(
+    plant="pitch",
+    preset="default",
+    steps=128_000,
+    environments=16,
+    updates=4,
+    prefill=8_000,
+    replay=200_000,
+    epoch=6_400,
+    residual=True,
+    reward_scale=0.1,
+    noise_theta=0.15,
+    noise_sigma=(0.0125, 0.1),
+    ddpg=DDPGConfig(
+        hidden=(128, 128),
+        layer_norm=True,
+        actor_rate=3e-4,
+        critic_rate=1e-3,
+        rate_decay="cosine",
+        critic_l2=0.0,
+        batch_size=256,
+        discount=0.97,
+        polyak=0.005,
+        saturation_penalty=1e-3,
+    ),
+)
+PRESETS: dict[str, dict[str, TrainConfig]] = {
+    "pitch": {"default": DEFAULT, "paper": PAPER},
+    "heaters": {
+        "default": replace(
+            DEFAULT, plant="heaters", reward_scale=1.0, ddpg=replace(DEFAULT.ddpg, discount=0.95)
+        ),
+        "paper": replace(PAPER, plant="heaters", steps=400_000),
+    },
+}
+
+
+def preset(plant: str, name: str = "default") -> TrainConfig:
+    """The preset called `name` of a plant; a plant without presets of its own takes those of pitch.
+
+    Raises:
+        ValueError: unknown plant or preset; lists those that exist.
+    """
+    plants.resolve(plant)
+    presets = PRESETS.get(plant, PRESETS["pitch"])
+    if name not in presets:
+        raise ValueError(f"there is no preset {name!r} for {plant}; the presets are: {', '.join(presets)}")
+    return replace(presets[name], plant=plant)
+
+
+def to_dict(config: TrainConfig) -> dict[str, Any]:
+    """Plain dict, for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict[str, Any]) -> TrainConfig:
+    """The configuration from what `to_dict` gave, also after a round trip through JSON.
+
+    Raises:
+        ValueError: a field is missing or unknown, or a value is not allowed.
+    """
+
+    def build(cls: type, values: dict[str, Any]) -> Any:
+        names = {f.name for f in dataclasses.fields(cls)}
+        if set(values) != names:
+            raise ValueError(f"the configuration has fields {sorted(set(values) ^ names)} missing or unknown")
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+
+    return build(TrainConfig, {**values, "ddpg": build(DDPGConfig, values.get("ddpg", {}))})

@@ -1,0 +1,49 @@
+"""The learned policy: observer, actor, and the map from its action to r~."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.agents.ddpg import DDPG
+from jaxouter.loop.observation import Memory, Observer
+from jaxouter.loop.policy import AffineParams
+
+
+class LearnedParams(NamedTuple):
+    """What the learned policy needs to act."""
+
+    actor: Any
+    prior: AffineParams  # r~ of a zero action; the middle of the range, or the static prefilter
+
+
+@dataclass(frozen=True)
+class LearnedPolicy:
+    """r~ = clip(prior(r) + half the range of r~ times the actor's action)."""
+
+    observer: Observer
+    learner: DDPG
+    host: bool = False
+
+    def r_tilde(self, prior: AffineParams, r: jax.Array, action: jax.Array) -> jax.Array:
+        """r~ (scalar, clipped to its bounds) of an action in [-1, 1] (scalar)."""
+        low, high = self.observer.r_tilde_bounds
+        return jnp.clip(prior.offset + prior.slope * r + (high - low) / 2 * action, low, high)
+
+    def init(self, params: LearnedParams, r0: jax.Array, y0: jax.Array) -> Memory:
+        """Memory before the first step."""
+        del params
+        return self.observer.init(r0, y0)
+
+    def act(
+        self, params: LearnedParams, carry: Memory, r: jax.Array, y: jax.Array, key: chex.PRNGKey | None = None
+    ) -> tuple[Memory, jax.Array]:
+        """Observe, act, remember; without exploration."""
+        del key
+        memory, obs = self.observer.observe(carry, r, y)
+        r_tilde = self.r_tilde(params.prior, r, self.learner.act(params.actor, obs)[0])
+        return self.observer.record(memory, y, r_tilde), r_tilde

@@ -1,0 +1,214 @@
+"""The training pipeline: prefill, then epochs in which environments roll out in parallel and the learner updates.
+
+Everything that training changes is one pytree, `TrainState`; `prefill` and `epoch` are pure functions of it, jitted and
+donated. Plain Python between them draws progress, evaluates and saves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.agents import noise
+from jaxouter.agents.ddpg import DDPG, Batch, LearnerState, n_step_return
+from jaxouter.agents.replay import Replay, ReplayState
+from jaxouter.loop import environment, identify
+from jaxouter.loop.environment import Environment, EnvParams, EnvState
+from jaxouter.loop.observation import Signals
+from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.references import SetPoint
+from jaxouter.plants import make as make_plant
+from jaxouter.training.config import TrainConfig
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+
+FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
+HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
+
+
+class TrainState(NamedTuple):
+    """All training state of one seed."""
+
+    learner: LearnerState
+    replay: ReplayState
+    env: EnvState  # (E, ...)
+    obs: jax.Array  # (E, n)
+    noise: jax.Array  # (E,), exploration noise
+    prior: AffineParams  # of the policy
+    key: chex.PRNGKey
+    steps: jax.Array  # int32, environment steps so far
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """The pure functions of one training run. Static and hashable."""
+
+    config: TrainConfig
+    env: Environment
+    policy: LearnedPolicy
+    replay: Replay
+
+    def start(self, seed: int, params: EnvParams) -> TrainState:
+        """State before the prefill: the prior identified, everything else fresh."""
+        key_prior, key = jax.random.split(jax.random.key(seed))
+        return self.init(key, params, self.prior(key_prior, params))
+
+    @property
+    def learner(self) -> DDPG:
+        """The learner inside the policy."""
+        return self.policy.learner
+
+    def prior(self, key: chex.PRNGKey, params: EnvParams) -> AffineParams:
+        """r~ of a zero action: the static prefilter, identified, where the policy is a residual; else the middle.
+
+        Raises:
+            ValueError: the identification failed.
+        """
+        if self.config.residual:
+            return identify.static(self.env.plant, params.plant, key)[1]
+        low, high = self.env.plant.r_tilde_bounds
+        return AffineParams(jnp.zeros(()), jnp.asarray((low + high) / 2, float))
+
+    @partial(jax.jit, static_argnums=0)
+    def init(self, key: chex.PRNGKey, params: EnvParams, prior: AffineParams) -> TrainState:
+        """Fresh networks and environments, and an empty replay."""
+        key, key_learner, key_env = jax.random.split(key, 3)
+        environments = self.config.environments
+        obs, env = jax.vmap(self.env.reset, (0, None))(jax.random.split(key_env, environments), params)
+        return TrainState(
+            learner=self.learner.init(key_learner),
+            replay=self.replay.init(),
+            env=env,
+            obs=obs,
+            noise=jnp.zeros(environments),
+            prior=prior,
+            key=key,
+            steps=jnp.zeros((), jnp.int32),
+        )
+
+    def policy_params(self, state: TrainState) -> LearnedParams:
+        """What the policy has learned so far."""
+        return LearnedParams(state.learner.actor, state.prior)
+
+    def vector_step(
+        self, state: TrainState, params: EnvParams, action: jax.Array, key: chex.PRNGKey
+    ) -> tuple[TrainState, jax.Array, jax.Array]:
+        """Every environment takes one step with its action (E,), and its row goes into the replay.
+
+        Returns:
+            The state, rewards (E,) as the plant gives them, and whether each episode ended (E,).
+        """
+        before = state.env
+        r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.prior, before.r, action)
+        keys = jax.random.split(key, self.config.environments)
+        obs, env, reward, terminated, truncated, info = jax.vmap(self.env.step, (0, 0, 0, None))(
+            keys, before, r_tilde, params
+        )
+        signals = Signals(
+            r=before.r,
+            y=before.y_seen,
+            integral=before.memory.integral,
+            r_tilde=r_tilde,
+            age=before.count.astype(reward.dtype),
+            r_next=info["r"],
+            y_next=info["y"],
+        )
+        flags = [flag.astype(reward.dtype) for flag in (terminated, truncated)]
+        row = jnp.stack([*signals, action, reward * self.config.reward_scale, *flags], -1)
+        state = state._replace(
+            env=env,
+            obs=obs,
+            replay=self.replay.write(state.replay, row),
+            steps=state.steps + self.config.environments,
+        )
+        return state, reward, terminated | truncated
+
+    def batch(self, replay: ReplayState, key: chex.PRNGKey) -> Batch:
+        """A batch of transitions, built from windows of signals."""
+        cfg = self.config.ddpg
+        windows, _ = self.replay.sample(replay, key, cfg.batch_size)
+
+        def transition(rows: jax.Array) -> Batch:
+            field = dict(zip(FIELDS, rows.T, strict=True))
+            signals = Signals(*(field[name] for name in Signals._fields))
+            first = self.replay.lead
+            reward, discount, used = n_step_return(
+                field["reward"][first:], field["terminated"][first:] > 0, field["truncated"][first:] > 0, cfg.discount
+            )
+            obs, next_obs = self.env.observer.before_and_after(signals, first, first + used)
+            return Batch(obs, field["action"][first][None], reward, discount, next_obs)
+
+        return jax.vmap(transition)(windows)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
+        """Random actions, each held for ten steps on average, until the replay holds `config.prefill` steps."""
+        environments = self.config.environments
+
+        def step(carry: tuple[TrainState, jax.Array], _: None) -> tuple[tuple[TrainState, jax.Array], None]:
+            state, action = carry
+            key, key_redraw, key_action, key_env = jax.random.split(state.key, 4)
+            redraw = jax.random.uniform(key_redraw, (environments,), float) < HOLD
+            fresh = jax.random.uniform(key_action, (environments,), float, -1.0, 1.0)
+            action = jnp.where(redraw, fresh, action)
+            state, _, _ = self.vector_step(state._replace(key=key), params, action, key_env)
+            return (state, action), None
+
+        first = jax.random.uniform(jax.random.fold_in(state.key, 0), (environments,), float, -1.0, 1.0)
+        (state, _), _ = jax.lax.scan(step, (state, first), None, self.config.prefill // environments)
+        return state
+
+    @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
+    def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
+        """`steps` environment steps (over all environments) of exploration and learning.
+
+        Returns:
+            The state, and means over the epoch: the learner's metrics and `reward` (a step, with exploration).
+        """
+        cfg = self.config
+        low, high = cfg.noise_sigma
+        sigma = jnp.geomspace(low, high, cfg.environments) if cfg.environments > 1 else jnp.full(1, high)
+
+        def update(carry: LearnerState, key: chex.PRNGKey, replay: ReplayState) -> tuple[LearnerState, Any]:
+            key_batch, key_update = jax.random.split(key)
+            return self.learner.update(carry, self.batch(replay, key_batch), key_update)
+
+        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            key, key_noise, key_env, key_updates = jax.random.split(state.key, 4)
+            progress = state.steps.astype(float) / cfg.steps
+            volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
+            normal = jax.random.normal(key_noise, state.noise.shape, state.noise.dtype)
+            explore = noise.ornstein_uhlenbeck(state.noise, normal, cfg.noise_theta, volatility)
+            action = jnp.clip(self.learner.act(state.learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
+            state, reward, done = self.vector_step(state._replace(key=key), params, action, key_env)
+            learner, metrics = jax.lax.scan(
+                partial(update, replay=state.replay), state.learner, jax.random.split(key_updates, cfg.updates)
+            )
+            state = state._replace(learner=learner, noise=jnp.where(done, 0.0, explore))
+            return state, {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
+
+        state, metrics = jax.lax.scan(step, state, None, steps // cfg.environments)
+        return state, jax.tree.map(jnp.mean, metrics)
+
+
+def build(config: TrainConfig) -> tuple[Trainer, EnvParams]:
+    """The trainer of a configuration, and the parameters of its environments.
+
+    Raises:
+        ValueError: the configuration does not fit together.
+    """
+    plant, _ = make_plant(config.plant)
+    env, params = environment.make(
+        config.plant,
+        history=config.history,
+        integral_steps=config.integral_steps,
+        goal=SetPoint(*plant.setpoint_range, config.redraw),
+    )
+    learner = DDPG(config.ddpg, env.observer.size, total_updates=config.total_updates)
+    per_environment = min(config.replay, config.steps) // config.environments  # it never holds more than there is
+    replay = Replay(FIELDS, config.environments, per_environment, env.observer.history, config.ddpg.n_step)
+    return Trainer(config, env, LearnedPolicy(env.observer, learner), replay), params
