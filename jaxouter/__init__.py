@@ -2,4 +2,5 @@
 
 from jaxouter.loop.environment import make
 
-__all__ = ["make"]
+__all__ = ["__version__", "make"]
+__version__ = "0.1.0"

@@ -6,7 +6,7 @@ One transition is unbatched in the small functions; `update` vmaps them over a b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import chex
 import jax
@@ -51,7 +51,7 @@ class DDPGConfig:
     target_noise_clip: float = 0.5
     """TD3: largest such noise."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         """Raises ValueError, naming field, value and what is allowed."""
         positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay")
         not_negative = ("critic_l2", "saturation_penalty", "target_noise", "target_noise_clip")
@@ -65,6 +65,11 @@ class DDPGConfig:
             raise ValueError(f"ddpg.discount is {self.discount}; it must lie in [0, 1)")
         if not 0 < self.polyak <= 1:
             raise ValueError(f"ddpg.polyak is {self.polyak}; it must lie in (0, 1]")
+        if self.critics not in (1, 2) or self.rate_decay not in ("constant", "cosine"):
+            raise ValueError(
+                f"ddpg.critics is {self.critics} and ddpg.rate_decay is {self.rate_decay!r}; "
+                "they must be 1 or 2, and constant or cosine"
+            )
         if len(self.hidden) < 2 or min(self.hidden) < 1:
             raise ValueError(f"ddpg.hidden is {self.hidden}; it must be at least two positive widths")
 
@@ -112,7 +117,7 @@ def n_step_return(
 
 
 def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
-    """g = R + discount Q'(s', mu'(s')), with the least of the target critics (paper eq. 4).
+    """G = R + discount Q'(s', mu'(s')), with the least of the target critics (paper eq. 4).
 
     Args:
         reward, discount: scalars; the discount is 0 where terminated.
@@ -187,15 +192,17 @@ class DDPG:
 
     def act(self, actor: Any, obs: jax.Array) -> jax.Array:
         """mu(s): obs (..., n) -> action (..., m) in [-1, 1]."""
-        return jnp.tanh(self.actor.apply(actor, obs))
+        return jnp.tanh(self.before_tanh(actor, obs))
+
+    def before_tanh(self, actor: Any, obs: jax.Array) -> jax.Array:
+        """The actor's output before its tanh: obs (..., n) -> (..., m)."""
+        return cast(jax.Array, self.actor.apply(actor, obs))
 
     def values(self, critics: tuple[Any, ...], obs: jax.Array, action: jax.Array) -> jax.Array:
         """Q of each critic: (B, n), (B, m) -> (B, critics)."""
-        return jnp.stack([self.critic.apply(critic, obs, action) for critic in critics], -1)
+        return jnp.stack([cast(jax.Array, self.critic.apply(critic, obs, action)) for critic in critics], -1)
 
-    def update(
-        self, state: LearnerState, batch: Batch, key: chex.PRNGKey
-    ) -> tuple[LearnerState, dict[str, jax.Array]]:
+    def update(self, state: LearnerState, batch: Batch, key: chex.PRNGKey) -> tuple[LearnerState, dict[str, jax.Array]]:
         """One gradient step of critic, actor and targets (paper eq. 2 to 5, algorithm 1).
 
         Args:
@@ -226,9 +233,9 @@ class DDPG:
 
         def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array]]:
             def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
-                before_tanh = self.actor.apply(actor, batch.obs)
+                before_tanh = self.before_tanh(actor, batch.obs)
                 action = jnp.tanh(before_tanh)
-                value = self.critic.apply(state.critics[0], batch.obs, action)
+                value = self.values(state.critics[:1], batch.obs, action)
                 loss = -jnp.mean(value) + cfg.saturation_penalty * jnp.mean(before_tanh**2)
                 return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
 

@@ -28,7 +28,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        """obs (..., n) -> pre-activation (..., actions); the action is its tanh."""
+        """Obs (..., n) -> pre-activation (..., actions); the action is its tanh."""
         x = obs
         for features in self.hidden:
             x = nn.relu(dense(features, x.shape[-1])(x))
@@ -43,7 +43,7 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """obs (..., n), action (..., actions) -> Q (...)."""
+        """Obs (..., n), action (..., actions) -> Q (...)."""
         x = obs
         for i, features in enumerate(self.hidden):
             x = jnp.concatenate([x, action], -1) if i == 1 else x

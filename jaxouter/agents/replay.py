@@ -19,7 +19,7 @@ class ReplayState(NamedTuple):
     """Contents of the replay."""
 
     rows: jax.Array  # (E, mirror + steps, width), float32
-    count: jax.Array  # int32, rows written so far in each environment
+    written: jax.Array  # int32, rows written so far in each environment
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class Replay:
         """Add one row (width,) of each environment: rows (E, width)."""
         chex.assert_shape(rows, (self.environments, len(self.fields)))
         slab = rows.astype(jnp.float32)[:, None, :]
-        position = state.count % self.steps + self.mirror
+        position = state.written % self.steps + self.mirror
         twin = jnp.where(position >= self.steps, position - self.steps, position)
         buffer = jax.lax.dynamic_update_slice(state.rows, slab, (0, position, 0))
         buffer = jax.lax.dynamic_update_slice(buffer, slab, (0, twin, 0))
-        return ReplayState(buffer, state.count + 1)
+        return ReplayState(buffer, state.written + 1)
 
     def sample(self, state: ReplayState, key: chex.PRNGKey, n: int) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.
@@ -75,8 +75,8 @@ class Replay:
         """
         key_environment, key_row = jax.random.split(key)
         environment = jax.random.randint(key_environment, (n,), 0, self.environments)
-        oldest = jnp.maximum(self.window - 1, state.count - self.steps + self.mirror)
-        last = jax.random.randint(key_row, (n,), oldest, state.count)  # number of a window's last row
+        oldest = jnp.maximum(self.window - 1, state.written - self.steps + self.mirror)
+        last = jax.random.randint(key_row, (n,), oldest, state.written)  # number of a window's last row
         size = (1, self.mirror + 1, len(self.fields))
         rows = jax.vmap(lambda e, i: jax.lax.dynamic_slice(state.rows, (e, i, jnp.zeros_like(i)), size)[0])(
             environment, last % self.steps

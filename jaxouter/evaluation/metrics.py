@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
         iae, ise: integrals of |e| and e^2 over an episode; itae: integral of t |e| over a set-point, t from its start;
         overshoot: beyond the set-point, % of the step; settling_time: until |e| stays within 5 % of the step, where one
         that never does counts as infinite; both the median over set-points, since small steps give any value;
-        steady_state_error: |mean of e| over the last tenth of a set-point; violation_time: share of steps outside the limits; violation_max: largest excess;
+        steady_state_error: |mean of e| over the last tenth of a set-point;
+        violation_time: share of steps outside the limits; violation_max: largest excess;
         violation_time_each, violation_max_each: the same over the plant's single outputs (houses);
         r_tilde_tv: total variation of r~ in an episode; return: sum of rewards in an episode.
         A trace that is not finite gives None throughout and `diverged: True`.
@@ -73,7 +75,7 @@ def _segments(traces: Traces) -> Iterator[tuple[float, float, np.ndarray]]:
     """Of each held set-point: y at its start, r, and y (n,) after each of its steps."""
     for y0, r, y in zip(traces.y0, traces.r, traces.y, strict=True):
         starts = [0, *(np.flatnonzero(np.diff(r)) + 1), len(r)]
-        for a, b in zip(starts[:-1], starts[1:], strict=True):
+        for a, b in pairwise(starts):
             yield (y0 if a == 0 else y[a - 1]), r[a], y[a:b].astype(np.float64)
 
 

@@ -13,6 +13,8 @@ import numpy as np
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import rewards, sensor
 from jaxouter.loop.policy import Policy
+from jaxouter.loop.rewards import RewardParams
+from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant
 
 
@@ -43,12 +45,19 @@ class _Inputs(NamedTuple):
 
     params: Any
     change: tuple[jax.Array, Any] | None
-    sensor: sensor.SensorParams
-    reward: rewards.RewardParams
+    sensor: SensorParams
+    reward: RewardParams
 
 
-def excess(plant: Plant, y: jax.Array, y_before: jax.Array) -> jax.Array:
+def _axes(inputs: _Inputs) -> Any:
+    """Which leaves have an axis of episodes, for vmap."""
+    axes: Any = (0, None if inputs.change is None else (None, 0), None, None)
+    return _Inputs(*axes)
+
+
+def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike) -> jax.Array:
     """By how much y (any shape) is outside the plant's limits; at most 0 where inside."""
+    y, y_before = jnp.asarray(y), jnp.asarray(y_before)
     over = jnp.full_like(y, -jnp.inf)
     if plant.output_limit is not None:
         over = jnp.maximum(over, jnp.abs(y) - plant.output_limit)
@@ -104,8 +113,7 @@ def _rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inp
         memory = policy.init(policy_params, r[0], run.y_seen)
         return run.y, jax.lax.scan(step, (run, memory), xs)[1]
 
-    axes = _Inputs(0, None if inputs.change is None else (None, 0), None, None)
-    return jax.vmap(episode, (axes, 0, 0))(inputs, r, keys)
+    return jax.vmap(episode, (_axes(inputs), 0, 0))(inputs, r, keys)
 
 
 def rollout(policy: Policy, policy_params: Any, scenario: Scenario, record_members: bool = False) -> Traces:
@@ -141,14 +149,15 @@ def rollout(policy: Policy, policy_params: Any, scenario: Scenario, record_membe
 
 @partial(jax.jit, static_argnums=0)
 def _begin_all(plant: Plant, inputs: _Inputs, keys: Any) -> _Run:
-    return jax.vmap(_begin, (None, _Inputs(0, None, None, None), 0))(plant, inputs._replace(change=None), keys)
+    return jax.vmap(partial(_begin, plant), (_axes(inputs), 0))(inputs, keys)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _advance_all(plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: Any, r: Any, r_tilde: Any, keys: Any) -> Any:
-    axes = _Inputs(0, None if inputs.change is None else (None, 0), None, None)
+def _advance_all(
+    plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: Any, r: Any, r_tilde: Any, keys: Any
+) -> Any:
     step = partial(_advance, plant, record)
-    return jax.vmap(step, (axes, 0, None, 0, 0, 0))(inputs, run, k, r, r_tilde, keys)
+    return jax.vmap(step, (_axes(inputs), 0, None, 0, 0, 0))(inputs, run, k, r, r_tilde, keys)
 
 
 def _host_rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inputs: _Inputs, r: Any, keys: Any):

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxouter.loop import sensor
+from jaxouter.loop import sensor as sensors
 from jaxouter.loop.references import FAMILIES
+from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant, make
 from jaxouter.plants.pitch import W_PRINTED
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
 NOISE_SEEDS = 32
+Builder = Callable[[int | None], "Scenario"]
 PITCH_SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
 PITCH_MAX_DELAY = 5.7  # s; one length of the delay lines for all scenarios, so that they share a compilation
 HEATERS_SETPOINTS = (15.0, 20.0, 17.0, 22.0)  # degC, 50 h each
@@ -34,8 +36,14 @@ class Scenario:
     segments: bool = True  # r is made of held set-points
     stable_alone: bool = True  # the inner loop alone is stable
     change: tuple[int, Any] | None = None  # from this control step on, these parameters
-    sensor: sensor.SensorParams = sensor.params()
+    sensor: SensorParams = field(default_factory=sensors.params)
     paper: tuple[float, float] | None = None  # MAE in the paper: inner loop alone, its DRL
+
+    def first(self) -> Scenario:
+        """The first episode alone."""
+        cut = lambda tree: jax.tree.map(lambda leaf: leaf[:1], tree)  # noqa: E731
+        change = None if self.change is None else (self.change[0], cut(self.change[1]))
+        return replace(self, params=cut(self.params), r=self.r[:1], keys=self.keys[:1], change=change)
 
 
 def _scenario(name: str, plant: Plant, params: Any, r: Any, episodes: int, **rest: Any) -> Scenario:
@@ -57,8 +65,12 @@ def _repeat(params: Any, episodes: int) -> Any:
 
 
 def _pitch(
-    name: str, episodes: int = 1, change: dict[str, Any] | None = None, rest: dict[str, Any] | None = None, **overrides: Any
-) -> Callable[[int | None], Scenario]:
+    name: str,
+    episodes: int = 1,
+    change: dict[str, Any] | None = None,
+    rest: dict[str, Any] | None = None,
+    **overrides: Any,
+) -> Builder:
     def build(wanted: int | None) -> Scenario:
         n = wanted or episodes
         plant, params = make("pitch", max_delay=PITCH_MAX_DELAY, **overrides)
@@ -74,7 +86,7 @@ def _pitch(
 
 def _heaters(
     name: str, change: dict[str, Any] | None = None, rest: dict[str, Any] | None = None, **overrides: Any
-) -> Callable[[int | None], Scenario]:
+) -> Builder:
     def build(wanted: int | None) -> Scenario:
         n = wanted or NOISE_SEEDS
         plant, params = make("heaters", **overrides)
@@ -99,7 +111,7 @@ def _mixed_stock(wanted: int | None) -> Scenario:
     return replace(base, params=base.params.replace(house=house))
 
 
-def _family(name: str, kind: str, family_seed: int) -> Callable[[int | None], Scenario]:
+def _family(name: str, kind: str, family_seed: int) -> Builder:
     """A family of references drawn from the seed; heaters: 1000 houses whose mean start is drawn too."""
 
     def build(wanted: int | None) -> Scenario:
@@ -118,7 +130,7 @@ def _family(name: str, kind: str, family_seed: int) -> Callable[[int | None], Sc
     return build
 
 
-def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Callable[[int | None], Scenario]]:
+def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Builder]:
     """Every scenario of a plant: id -> function of the number of episodes (None: its own number).
 
     A plant without scenarios of its own has the families that it declares.
@@ -126,7 +138,7 @@ def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Callable[[
     plant, _ = make(name)
     unstable = {"stable_alone": False}
     delays = {"paper": (10.13, 2.46)}  # the paper's one delayed case; no reading of it gives its 10.13 exactly
-    noisy_pitch, noisy_heaters = ({"sensor": sensor.params(noise=noise)} for noise in (0.2, 0.1))
+    noisy_pitch, noisy_heaters = ({"sensor": sensors.params(noise=noise)} for noise in (0.2, 0.1))
     own = {
         "pitch": {
             "paper": _pitch("paper", rest={"paper": (10.91, 3.90)}),
@@ -151,8 +163,8 @@ def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Callable[[
     return {f"{name}/{key}": build for key, build in (own | families).items()}
 
 
-def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_SEED) -> Scenario:
-    """The scenario called `identifier`, such as `pitch/paper`.
+def builder(identifier: str, family_seed: int = FAMILY_SEED) -> Builder:
+    """The function that makes the scenario called `identifier`, such as `pitch/paper`.
 
     Raises:
         ValueError: there is no such plant or scenario; lists those that exist.
@@ -161,13 +173,22 @@ def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_
     scenarios = catalogue(name, family_seed)
     if identifier not in scenarios:
         raise ValueError(f"there is no scenario {identifier!r}; {name} has: {', '.join(scenarios)}")
-    return scenarios[identifier](episodes)
+    return scenarios[identifier]
+
+
+def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_SEED) -> Scenario:
+    """The scenario called `identifier`, with so many episodes (None: its own number).
+
+    Raises:
+        ValueError: there is no such plant or scenario; lists those that exist.
+    """
+    return builder(identifier, family_seed)(episodes)
 
 
 def paper_scenarios(name: str) -> list[str]:
     """Ids of the scenarios whose figure stands in the paper; where there are none, all of the plant's."""
     if name == "pitch":
-        return ["pitch/paper", "pitch/delay-0.57", "pitch/delay-5.7", "pitch/delay-swapped"]
+        return ["pitch/paper", "pitch/delay-5.7", "pitch/delay-0.57", "pitch/delay-swapped"]
     if name == "heaters":
         return ["heaters/paper-4", "heaters/paper-1000"]
     return list(catalogue(name))

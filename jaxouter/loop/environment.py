@@ -20,6 +20,8 @@ from flax import struct
 from jaxouter.loop import rewards, sensor
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
+from jaxouter.loop.rewards import RewardParams
+from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant
 from jaxouter.plants import make as make_plant
 
@@ -29,8 +31,8 @@ class EnvParams:
     """Everything that may be swept without recompiling."""
 
     plant: Any
-    sensor: sensor.SensorParams
-    reward: rewards.RewardParams
+    sensor: SensorParams
+    reward: RewardParams
 
 
 class EnvState(NamedTuple):
@@ -43,7 +45,7 @@ class EnvState(NamedTuple):
     r: jax.Array  # reference r_k
     y: jax.Array  # true output y_k
     y_seen: jax.Array  # measured output
-    count: jax.Array  # int32, k
+    k: jax.Array  # int32, k
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class Environment:
 
         low, high = plant.divergence_bounds
         terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
-        truncated = state.count + 1 >= plant.episode_steps
+        truncated = state.k + 1 >= plant.episode_steps
         y = jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y)
         reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, state.memory.r_tilde_past[0])
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
@@ -103,7 +105,7 @@ class Environment:
         goal, r = self.goal.step(state.goal, y_seen)
         memory = self.observer.record(state.memory, state.y_seen, r_tilde)
         memory, obs = self.observer.observe(memory, r, y_seen)
-        state = EnvState(plant_state, state.plant_params, goal, memory, r, y, y_seen, state.count + 1)
+        state = EnvState(plant_state, state.plant_params, goal, memory, r, y, y_seen, state.k + 1)
         return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": y_seen}
 
     def step(

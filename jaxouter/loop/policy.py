@@ -18,7 +18,10 @@ class Policy(Protocol):
     A JAX policy must be hashable (a frozen dataclass); what is learned or tuned goes into `params`, a pytree.
     """
 
-    host: bool
+    @property
+    def host(self) -> bool:
+        """Whether it is plain NumPy or Python."""
+        ...
 
     def init(self, params: Any, r0: jax.Array, y0: jax.Array) -> Any:
         """Carry before the first step, from the first reference and output."""
@@ -40,7 +43,7 @@ class AffineParams(NamedTuple):
 
 @dataclass(frozen=True)
 class Affine:
-    """r~ = offset + slope r, clipped: with (1, 0) the inner loop alone, with the inverse DC gain the static prefilter."""
+    """r~ = offset + slope r, clipped: with slope 1 the inner loop alone, with 1 / gain the static prefilter."""
 
     r_tilde_bounds: tuple[float, float]
     host: bool = False

@@ -1,8 +1,8 @@
 """References: families of whole trajectories, and goal generators that an environment asks step by step.
 
 A family is a pure function `family(key, steps, low, high) -> r`, r of shape (steps,) within [low, high]. A goal
-generator is `init(key, y0) -> (state, r0)` and `step(state, y) -> (state, r)`: the next reference may depend on what the
-plant does (paper section II: 'a human operator that interacts with the observed state').
+generator is `init(key, y0) -> (state, r0)` and `step(state, y) -> (state, r)`: the next reference may depend on
+what the plant does (paper section II: 'a human operator that interacts with the observed state').
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class FamilyState(NamedTuple):
     """State of `Family`."""
 
     r: jax.Array  # (steps,)
-    count: jax.Array  # int32
+    k: jax.Array  # int32
 
 
 @dataclass(frozen=True)
@@ -164,5 +164,5 @@ class Family:
     def step(self, state: FamilyState, y: jax.Array) -> tuple[FamilyState, jax.Array]:
         """The next value."""
         del y
-        count = jnp.minimum(state.count + 1, self.steps - 1)
-        return FamilyState(state.r, count), state.r[count]
+        k = jnp.minimum(state.k + 1, self.steps - 1)
+        return FamilyState(state.r, k), state.r[k]

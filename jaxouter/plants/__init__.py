@@ -30,7 +30,9 @@ def resolve(name: str) -> Callable[..., tuple[Plant, Any]]:
 
 
 def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
-    """A plant and its parameters, by name: `plant, params = make("pitch", tau=0.5, d1=0.57)`.
+    """A plant and its parameters, by name.
+
+    For example: `plant, params = make("pitch", tau=0.5, d1=0.57)`.
 
     Args:
         name: `pitch` or `heaters` (or whatever stands in `REGISTRY`).

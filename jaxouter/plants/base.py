@@ -56,7 +56,7 @@ class Plant:
     start: Callable[[chex.PRNGKey, Any], Any] | None = None
     """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
     draw: Callable[[chex.PRNGKey, Any], Any] | None = None
-    """`draw(key, params) -> params`: parameters of one training episode (domain randomisation); None: the given ones."""
+    """`draw(key, params) -> params`: parameters of a training episode (domain randomisation); None: the given ones."""
     members: Callable[[Any, Any], jax.Array] | None = None
     """`members(params, state) -> (n,)`: the single outputs of which y is a weighted mean; None: y is all there is."""
 

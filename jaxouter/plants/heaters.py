@@ -54,7 +54,7 @@ class HeatersState(NamedTuple):
 
     x: jax.Array  # (n,), air temperatures, degC
     x0: jax.Array  # (n,), temperatures at the start of the episode, degC
-    count: jax.Array  # int32, hours since the start of the episode
+    k: jax.Array  # int32, hours since the start of the episode
 
 
 def make(
@@ -131,7 +131,7 @@ def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
 
 
 def _state(x0: jax.Array) -> HeatersState:
-    return HeatersState(x=x0, x0=x0, count=jnp.zeros((), jnp.int32))
+    return HeatersState(x=x0, x0=x0, k=jnp.zeros((), jnp.int32))
 
 
 def output(params: HeatersParams, state: HeatersState) -> jax.Array:
@@ -171,11 +171,11 @@ def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: ch
 
     def inner(x: jax.Array, i_and_w: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         i, w = i_and_w
-        t = state.count.astype(x.dtype) * CONTROL_STEP + i * h
+        t = state.k.astype(x.dtype) * CONTROL_STEP + i * h
         return jax.vmap(euler_maruyama, (house_axes, 0, 0, None, 0))(params.house, x, state.x0, t, w), None
 
     x, _ = jax.lax.scan(inner, state.x, (jnp.arange(params.substeps, dtype=state.x.dtype), noise))
-    return HeatersState(x, state.x0, state.count + 1)
+    return HeatersState(x, state.x0, state.k + 1)
 
 
 HEATERS = Plant(

@@ -63,7 +63,7 @@ class PitchState(NamedTuple):
     xi: jax.Array  # pilot
     lines: jax.Array  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step
     r_tilde_line: jax.Array  # (M,), delay line of r~, a sample a control step
-    count: jax.Array  # int32, control steps since the start
+    k: jax.Array  # int32, control steps since the start
 
 
 def lqr(A: Any, B: Any, Q: Any, R: float) -> tuple[np.ndarray, float]:
@@ -98,7 +98,7 @@ def make(
     D_h: float = 0.1,
     Q: Sequence[float] = (0.0, 0.0, 0.0, 1.0, 2.5),
     R: float = 10.0,
-    K1: Sequence[float] | None = None,
+    K1: Any = None,
     K2: float | None = None,
     gain: float = 1.0,
     disturbance: float = 0.0,
@@ -132,9 +132,7 @@ def make(
         designed = lqr(A, B, Q, R)
         K1 = designed[0] if K1 is None else K1
         K2 = designed[1] if K2 is None else K2
-    scalars = dict(
-        tau=tau, d1=d1, d2=d2, A_h=A_h, B_h=B_h, C_h=C_h, D_h=D_h, K2=K2, gain=gain, disturbance=disturbance
-    )
+    scalars = dict(tau=tau, d1=d1, d2=d2, A_h=A_h, B_h=B_h, C_h=C_h, D_h=D_h, K2=K2, gain=gain, disturbance=disturbance)
     params = PitchParams(
         **{name: array(name, value, ()) for name, value in scalars.items()},
         W=array("W", W, (3,)),
@@ -157,7 +155,7 @@ def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
         xi=zero,
         lines=jnp.zeros((3, delay.length(params.max_delay, CONTROL_STEP / params.substeps))),
         r_tilde_line=jnp.zeros(delay.length(params.max_delay, CONTROL_STEP)),
-        count=jnp.zeros((), jnp.int32),
+        k=jnp.zeros((), jnp.int32),
     )
 
 
@@ -168,7 +166,7 @@ def start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
 
 
 def output(params: PitchParams, state: PitchState) -> jax.Array:
-    """y = theta = x4, crad."""
+    """Y = theta = x4, crad."""
     del params
     return state.x[3]
 
@@ -188,11 +186,11 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
     delays = jnp.stack([p.tau, p.d1, p.d2])
     lags = delays / h
     held = jnp.all((delays >= 0.0) & (delays <= p.max_delay + 1e-6))
-    r_tilde_line = delay.write(state.r_tilde_line, state.count, r_tilde)
+    r_tilde_line = delay.write(state.r_tilde_line, state.k, r_tilde)
 
     def inner(carry: tuple[jax.Array, jax.Array], i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
         z, lines = carry
-        n = state.count * p.substeps + i
+        n = state.k * p.substeps + i
         samples = jnp.stack([z[3], _dot(p.K1, z[:4]), p.K2 * z[4]])
         lines = jax.vmap(delay.write, (0, None, 0))(lines, n, samples)
         theta, k1x, k2xc = jax.vmap(delay.read, (0, None, 0))(lines, n, lags - 0.5)
@@ -201,9 +199,9 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
         return (_dot(transition, jnp.concatenate([z, jnp.stack([theta_e, u])])), lines), None
 
     z = jnp.concatenate([state.x, jnp.stack([state.xc, state.xi])])
-    (z, lines), _ = jax.lax.scan(inner, (z, state.lines), jnp.arange(p.substeps, dtype=state.count.dtype), unroll=5)
+    (z, lines), _ = jax.lax.scan(inner, (z, state.lines), jnp.arange(p.substeps, dtype=state.k.dtype), unroll=5)
     z = jnp.where(held, z, jnp.nan)
-    return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.count + 1)
+    return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.k + 1)
 
 
 def _discretise(p: PitchParams, h: float) -> jax.Array:

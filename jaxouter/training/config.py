@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
@@ -14,7 +16,7 @@ from jaxouter.agents.ddpg import DDPGConfig
 class TrainConfig:
     """One training run. Every field is an option of `python -m jaxouter.train`."""
 
-    plant: str
+    plant: Annotated[str, tyro.conf.Positional]
     """Plant to learn on."""
     preset: str
     """The preset that gave the defaults."""
@@ -29,7 +31,7 @@ class TrainConfig:
     updates: int = 1
     """Gradient updates after each step of all environments; updates / environments is the update-to-data ratio."""
     prefill: int = 1_000
-    """Environment steps of random held actions before the first update."""
+    """Environment steps with random actions, each held a while, before the first update."""
     replay: int = 1_000_000
     """Environment steps that the replay holds."""
     epoch: int = 2_000
@@ -53,9 +55,14 @@ class TrainConfig:
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     """The learner."""
 
-    def __post_init__(self) -> None:
-        """Raises ValueError, naming field, value and what is allowed."""
+    def check(self) -> TrainConfig:
+        """Itself.
+
+        Raises:
+            ValueError: names the field, its value and what is allowed.
+        """
         plants.resolve(self.plant)
+        self.ddpg.check()
         for name in ("seeds", "steps", "environments", "updates", "epoch", "reward_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
@@ -84,6 +91,7 @@ class TrainConfig:
                 f"noise_sigma is {self.noise_sigma} and noise_end is {self.noise_end}; "
                 "they must be positive and not negative"
             )
+        return self
 
     @property
     def epochs(self) -> int:
@@ -96,7 +104,7 @@ class TrainConfig:
         return (self.steps - self.prefill) // self.environments * self.updates
 
 
-PAPER = TrainConfig(plant="pitch", preset="paper")
+PAPER = TrainConfig(plant="pitch", preset="paper", prefill=200)
 DEFAULT = TrainConfig(
     plant="pitch",
     preset="default",
@@ -126,9 +134,7 @@ DEFAULT = TrainConfig(
 PRESETS: dict[str, dict[str, TrainConfig]] = {
     "pitch": {"default": DEFAULT, "paper": PAPER},
     "heaters": {
-        "default": replace(
-            DEFAULT, plant="heaters", reward_scale=1.0, ddpg=replace(DEFAULT.ddpg, discount=0.95)
-        ),
+        "default": replace(DEFAULT, plant="heaters", reward_scale=1.0, ddpg=replace(DEFAULT.ddpg, discount=0.95)),
         "paper": replace(PAPER, plant="heaters", steps=400_000),
     },
 }

@@ -52,32 +52,29 @@ class Trainer:
     policy: LearnedPolicy
     replay: Replay
 
-    def start(self, seed: int, params: EnvParams) -> TrainState:
-        """State before the prefill: the prior identified, everything else fresh."""
-        key_prior, key = jax.random.split(jax.random.key(seed))
-        return self.init(key, params, self.prior(key_prior, params))
-
     @property
     def learner(self) -> DDPG:
         """The learner inside the policy."""
         return self.policy.learner
 
-    def prior(self, key: chex.PRNGKey, params: EnvParams) -> AffineParams:
-        """r~ of a zero action: the static prefilter, identified, where the policy is a residual; else the middle.
+    def start(self, seed: int, params: EnvParams) -> TrainState:
+        """State before the prefill; the static prefilter is identified where the policy is its residual.
 
         Raises:
             ValueError: the identification failed.
         """
+        key_prior, key = jax.random.split(jax.random.key(seed))
+        state = self.fresh(key, params)
         if self.config.residual:
-            return identify.static(self.env.plant, params.plant, key)[1]
-        low, high = self.env.plant.r_tilde_bounds
-        return AffineParams(jnp.zeros(()), jnp.asarray((low + high) / 2, float))
+            return state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
+        return state
 
     @partial(jax.jit, static_argnums=0)
-    def init(self, key: chex.PRNGKey, params: EnvParams, prior: AffineParams) -> TrainState:
-        """Fresh networks and environments, and an empty replay."""
+    def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
+        """Random networks, reset environments, an empty replay; a zero action is the middle of the range of r~."""
         key, key_learner, key_env = jax.random.split(key, 3)
         environments = self.config.environments
+        low, high = self.env.plant.r_tilde_bounds
         obs, env = jax.vmap(self.env.reset, (0, None))(jax.random.split(key_env, environments), params)
         return TrainState(
             learner=self.learner.init(key_learner),
@@ -85,7 +82,7 @@ class Trainer:
             env=env,
             obs=obs,
             noise=jnp.zeros(environments),
-            prior=prior,
+            prior=AffineParams(jnp.zeros(()), jnp.asarray((low + high) / 2, float)),
             key=key,
             steps=jnp.zeros((), jnp.int32),
         )
@@ -113,7 +110,7 @@ class Trainer:
             y=before.y_seen,
             integral=before.memory.integral,
             r_tilde=r_tilde,
-            age=before.count.astype(reward.dtype),
+            age=before.k.astype(reward.dtype),
             r_next=info["r"],
             y_next=info["y"],
         )
@@ -149,7 +146,7 @@ class Trainer:
         """Random actions, each held for ten steps on average, until the replay holds `config.prefill` steps."""
         environments = self.config.environments
 
-        def step(carry: tuple[TrainState, jax.Array], _: None) -> tuple[tuple[TrainState, jax.Array], None]:
+        def step(carry: tuple[TrainState, jax.Array], _: Any) -> tuple[tuple[TrainState, jax.Array], None]:
             state, action = carry
             key, key_redraw, key_action, key_env = jax.random.split(state.key, 4)
             redraw = jax.random.uniform(key_redraw, (environments,), float) < HOLD
@@ -177,7 +174,7 @@ class Trainer:
             key_batch, key_update = jax.random.split(key)
             return self.learner.update(carry, self.batch(replay, key_batch), key_update)
 
-        def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+        def step(state: TrainState, _: Any) -> tuple[TrainState, dict[str, jax.Array]]:
             key, key_noise, key_env, key_updates = jax.random.split(state.key, 4)
             progress = state.steps.astype(float) / cfg.steps
             volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
@@ -201,7 +198,7 @@ def build(config: TrainConfig) -> tuple[Trainer, EnvParams]:
     Raises:
         ValueError: the configuration does not fit together.
     """
-    plant, _ = make_plant(config.plant)
+    plant, _ = make_plant(config.check().plant)
     env, params = environment.make(
         config.plant,
         history=config.history,

@@ -1,0 +1,135 @@
+"""What the commands share: errors for people, the compilation cache, progress, tables."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jaxouter import plants
+from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.evaluate import SIMPLE
+from jaxouter.training.config import PRESETS, TrainConfig
+
+console = Console()
+LINE_SECONDS = 5.0  # between two plain lines of progress
+
+
+@contextmanager
+def user_errors() -> Iterator[None]:
+    """A ValueError in here is the user's mistake: one message, exit status 2."""
+    try:
+        yield
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def use_compilation_cache() -> None:
+    """Keep compiled functions in the user's cache folder, unless JAX is told otherwise."""
+    if not jax.config.values["jax_compilation_cache_dir"]:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "jaxouter" / "xla"))
+
+
+def print_lists() -> None:
+    """Plants, presets, scenarios and policies."""
+    for name in plants.REGISTRY:
+        console.print(f"[bold]{name}[/bold]")
+        console.print("  presets:   " + ", ".join(PRESETS.get(name, PRESETS["pitch"])))
+        console.print("  scenarios: " + ", ".join(scenarios.catalogue(name)))
+    console.print("policies: a run folder, " + ", ".join(SIMPLE))
+
+
+class Interrupt:
+    """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can save itself; the second one ends it at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def __enter__(self) -> Interrupt:
+        self._before: dict[int, Any] = {}
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def _handle(self, number: int, frame: Any) -> None:
+        del frame
+        self.requested = True
+        print("\nstopping: the epoch ends, then everything is saved", file=sys.stderr)
+        signal.signal(number, self._before[number])
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+class TrainingProgress:
+    """A live bar for each seed on a terminal, plain lines elsewhere."""
+
+    def __init__(self, config: TrainConfig, unit: str) -> None:
+        self._config, self._unit = config, unit
+        self._bars = Progress(
+            TextColumn("seed {task.fields[seed]}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._tasks: dict[int, Any] = {}
+        self._begin = self._last = time.monotonic()
+        self._first: int | None = None
+
+    def __enter__(self) -> TrainingProgress:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
+        """Show the row of an epoch."""
+        cfg, epoch, now = self._config, row["epoch"], time.monotonic()
+        text = (
+            f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
+            f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {row['mae']:.3f} {self._unit}"
+        )
+        if console.is_terminal:
+            if seed not in self._tasks:
+                self._tasks[seed] = self._bars.add_task("", total=cfg.epochs, seed=seed, text="")
+            self._bars.update(self._tasks[seed], completed=epoch, text=text)
+        elif epoch == cfg.epochs or now - self._last >= LINE_SECONDS:
+            self._first = epoch - 1 if self._first is None else self._first
+            left = (now - self._begin) / max(1, epoch - self._first) * (cfg.epochs - epoch)
+            print(f"seed {seed}  epoch {epoch}/{cfg.epochs}  {text}  {left:.0f} s left", flush=True)
+            self._last = now
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table; the first column to the left, the others to the right; narrow output is not cut."""
+    out = Table(title=title, title_justify="left", header_style="bold")
+    for i, column in enumerate(columns):
+        out.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
+    for row in rows:
+        out.add_row(*row)
+    console.print(out)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A figure for a table; a dash where it is not defined."""
+    return "-" if value is None else f"{value:.{digits}f}" if abs(value) < 1000 else f"{value:.3g}"

@@ -1,0 +1,156 @@
+"""`python -m jaxouter.evaluate`: a trained run, or a simple policy, on any evaluation scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from jaxouter import cli, plants
+from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.evaluate import SIMPLE, Named, evaluate, result, simple_policy
+from jaxouter.evaluation.rollout import Traces
+from jaxouter.training.run import Run, write_json
+
+SHOWN = (
+    "mae",
+    "improvement",
+    "itae",
+    "overshoot",
+    "settling_time",
+    "steady_state_error",
+    "violation_time",
+    "r_tilde_tv",
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Evaluate a trained run, or a named simple policy, on scenarios that training never saw.
+
+    With a run folder the learned policy of its median seed is evaluated; a folder seed-N in it names another seed.
+    Without `--scenario` all scenarios of the plant are met, without a folder those of every plant.
+    """
+
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Run folder, or the folder of one seed in it."""
+    policy: str | None = None
+    """A simple policy instead: none (r~ = r) or static (inverse of the identified DC gain)."""
+    scenario: tuple[str, ...] = ()
+    """Scenarios, such as pitch/paper; see --list."""
+    episodes: int | None = None
+    """Episodes of each scenario; default: its own number (families 64, heaters 32)."""
+    family_seed: int = scenarios.FAMILY_SEED
+    """Seed of the reference families."""
+    json: Path | None = None
+    """Write all figures of merit to this file."""
+    traces: Path | None = None
+    """Write r, y and r~ of each scenario, (episodes, T) each, to this npz file."""
+    list: bool = False
+    """Print plants, presets, scenarios and policies, and end."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    with cli.user_errors():
+        options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
+        if options.list:
+            return cli.print_lists()
+        check(options)
+        cli.use_compilation_cache()
+        policies, origin = choose(options)
+        names = options.scenario or [name for plant in policies for name in scenarios.catalogue(plant)]
+        foreign = [name for name in names if name.split("/")[0] not in policies]
+        if foreign:
+            raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
+
+    results: dict[str, tuple[Traces, dict[str, Any]]] = {}
+    with cli.console.status("") as status:
+        for i, name in enumerate(names):
+            status.update(f"{name} ({i + 1} of {len(names)})")
+            scenario = scenarios.get(name, options.episodes, options.family_seed)
+            results |= evaluate(policies[scenario.plant.name], [scenario])
+    named = next(iter(policies.values()))
+    show(named.name, results)
+    if options.json is not None:
+        episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
+        write_json(options.json, result(named, results, **origin, family_seed=options.family_seed, episodes=episodes))
+        print(f"figures of merit: {options.json}")
+    if options.traces is not None:
+        arrays = {f"{name}/{key}": getattr(t, key) for name, (t, _) in results.items() for key in ("r", "y", "r_tilde")}
+        with options.traces.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        print(f"traces: {options.traces}")
+
+
+def check(options: Options) -> None:
+    """Everything that can be wrong and found without work.
+
+    Raises:
+        ValueError: the options do not fit together, or name what does not exist.
+    """
+    if options.run is None and options.policy is None:
+        raise ValueError(f"say what to evaluate: a run folder, or --policy with one of {', '.join(SIMPLE)}")
+    if options.policy is not None and options.policy not in SIMPLE:
+        raise ValueError(f"there is no policy {options.policy!r}; the policies are: {', '.join(SIMPLE)}")
+    if options.episodes is not None and options.episodes < 1:
+        raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
+    if not 0 <= options.family_seed < 2**32:
+        raise ValueError(f"--family-seed is {options.family_seed}; it must lie in [0, 2^32)")
+    for path in (options.json, options.traces):
+        if path is not None and (path.is_dir() or not path.resolve().parent.is_dir()):
+            raise ValueError(f"{path} can't be written: it must be a file in a folder that exists")
+    for name in options.scenario:
+        scenarios.builder(name)
+
+
+def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
+    """The policy for each plant, and where it comes from (for the JSON).
+
+    Raises:
+        ValueError: the folder is no run, or has no checkpoint.
+    """
+    if options.policy is not None:
+        given = {name.split("/")[0] for name in options.scenario} or set(plants.REGISTRY)
+        names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
+        return {name: simple_policy(options.policy, name) for name in names}, {}
+    assert options.run is not None  # as `check` found
+    run, seed = open_run(options.run)
+    state, _ = run.load(seed)
+    trainer, _ = run.trainer
+    named = Named("learned", trainer.policy, trainer.policy_params(state))
+    return {run.config.plant: named}, {"run": str(run.path), "seed": seed}
+
+
+def open_run(path: Path) -> tuple[Run, int]:
+    """The run in a folder and its median seed, or the seed whose folder it is.
+
+    Raises:
+        ValueError: the folder is no run.
+    """
+    name = path.resolve().name
+    if name.startswith("seed-") and not (path / "config.json").exists():
+        run = Run.open(path.resolve().parent)
+        seed = next((seed for seed in run.seeds if run.seed_folder(seed).name == name), None)
+        if seed is None:
+            raise ValueError(f"{path} is not a seed of its run, which has: {', '.join(map(str, run.seeds))}")
+        return run, seed
+    run = Run.open(path)
+    return run, run.median_seed()
+
+
+def show(policy: str, results: dict[str, tuple[Traces, dict[str, Any]]]) -> None:
+    """Print the table."""
+    rows = [
+        [name, *("diverged" if figures.get("diverged") else cli.number(figures[key]) for key in SHOWN)]
+        for name, (_, figures) in results.items()
+    ]
+    cli.table(f"policy {policy}", ["scenario", *(key.replace("_", " ") for key in SHOWN)], rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Evaluation of one policy on scenarios, as the commands need it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from jaxouter.evaluation.metrics import figures_of_merit, mae
+from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.loop import identify
+from jaxouter.loop.policy import Policy, none
+from jaxouter.plants import make
+
+SIMPLE = ("none", "static")
+
+
+@dataclass(frozen=True)
+class Named:
+    """A policy with its parameters and the name that it has in results."""
+
+    name: str
+    policy: Policy
+    params: Any
+
+
+def simple_policy(name: str, plant_name: str) -> Named:
+    """The policy `none`, or `static` identified on the nominal plant by 8 constant-r~ episodes.
+
+    Raises:
+        ValueError: unknown name; lists those that exist.
+    """
+    plant, params = make(plant_name)
+    if name == "none":
+        return Named(name, *none(plant))
+    if name == "static":
+        return Named(name, *identify.static(plant, params, jax.random.key(0)))
+    raise ValueError(f"there is no policy {name!r}; the policies are: {', '.join(SIMPLE)}")
+
+
+def evaluate(named: Named, scenarios: Iterable[Scenario]) -> dict[str, tuple[Traces, dict[str, Any]]]:
+    """Traces and figures of merit on each scenario, by id."""
+    results = {}
+    for scenario in scenarios:
+        traces = rollout(named.policy, named.params, scenario)
+        inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario)
+        results[scenario.id] = traces, figures_of_merit(traces, scenario, mae(inner))
+    return results
+
+
+def result(named: Named, results: dict[str, tuple[Traces, dict[str, Any]]], **extra: Any) -> dict[str, Any]:
+    """The evaluation as JSON values."""
+    scenarios = {identifier: figures for identifier, (_, figures) in results.items()}
+    return {"policy": named.name, **extra, "scenarios": scenarios}

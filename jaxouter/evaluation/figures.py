@@ -1,0 +1,206 @@
+"""Pictures of a run: the learning curve and the time responses, in the manner of the paper's figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import Traces
+from jaxouter.evaluation.scenarios import Scenario
+
+matplotlib.use("agg")
+
+INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"
+UNITS = {"degC": "°C"}
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25, linewidth=0.6)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _unit(scenario: Scenario) -> str:
+    return UNITS.get(scenario.plant.y_unit, scenario.plant.y_unit)
+
+
+def _times(scenario: Scenario, steps: int) -> np.ndarray:
+    return scenario.plant.control_step * np.arange(steps + 1)
+
+
+def _output(axes: Axes, scenario: Scenario, traces: Traces, color: str, label: str) -> None:
+    """Y of the first episode, r, and the limits on y."""
+    t, unit = _times(scenario, traces.r.shape[1]), _unit(scenario)
+    limit = scenario.plant.output_limit
+    if limit is not None:
+        for i, bound in enumerate((-limit, limit)):
+            axes.axhline(bound, color=LIMIT, ls=":", lw=1.2, label=f"limit ±{limit:g} {unit}" if i else None)
+    axes.step(
+        t, np.append(traces.r[0], traces.r[0, -1]), where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r"
+    )
+    y = np.append(traces.y0[0], traces.y[0])
+    axes.plot(t, y, color=color, lw=1.8, label=label)
+    axes.set_ylabel(f"y [{unit}]")
+    # An unstable inner loop must not squeeze everything else into a line.
+    low, high = scenario.plant.evaluation_range
+    room = high - low
+    axes.set_ylim(max(y.min(), low - 1.2 * room) - 0.06 * room, min(y.max(), high + 1.2 * room) + 0.06 * room)
+    if y.min() > low - 1.2 * room and y.max() < high + 1.2 * room:
+        axes.autoscale(axis="y")
+    axes.set_xlim(t[0], t[-1])
+
+
+def _modified(axes: Axes, scenario: Scenario, traces: Traces) -> None:
+    """r~ of the first episode and its bounds."""
+    t, unit = _times(scenario, traces.r.shape[1]), _unit(scenario)
+    low, high = scenario.plant.r_tilde_bounds
+    for i, bound in enumerate((low, high)):
+        axes.axhline(bound, color=LIMIT, ls=":", lw=1.2, label=f"bounds of r̃ [{low:g}, {high:g}] {unit}" if i else None)
+    axes.step(
+        t,
+        np.append(traces.r_tilde[0], traces.r_tilde[0, -1]),
+        where="post",
+        color=MODIFIED,
+        lw=1.4,
+        label="modified reference r̃",
+    )
+    axes.set_ylabel(f"r̃ [{unit}]")
+    axes.set_xlim(t[0], t[-1])
+
+
+def _houses(axes: Axes, scenario: Scenario, traces: Traces) -> None:
+    """The spread of the single outputs of the first episode."""
+    if traces.members is None:
+        return
+    t = _times(scenario, traces.r.shape[1])[1:]
+    quantiles = np.quantile(traces.members[0], [0.0, 0.05, 0.95, 1.0], axis=1)
+    axes.fill_between(t, quantiles[0], quantiles[3], color=LEARNED, alpha=0.12, lw=0, label="all houses")
+    axes.fill_between(t, quantiles[1], quantiles[2], color=LEARNED, alpha=0.25, lw=0, label="90 % of the houses")
+
+
+def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
+    """|change| a control step of y and of the single outputs, against the rate limit."""
+    t, unit = _times(scenario, traces.r.shape[1])[1:], _unit(scenario)
+    if traces.members is not None:
+        change = np.abs(np.diff(traces.members[0], axis=0))
+        axes.fill_between(t[1:], 0, change.max(1), color=LEARNED, alpha=0.12, lw=0, label="largest of all houses")
+        axes.fill_between(
+            t[1:], 0, np.quantile(change, 0.95, axis=1), color=LEARNED, alpha=0.25, lw=0, label="95 % of the houses"
+        )
+    axes.plot(t, np.abs(np.diff(traces.y[0], prepend=traces.y0[0])), color=LEARNED, lw=1.6, label="mean y")
+    limit = scenario.plant.rate_limit
+    if limit is not None:
+        axes.axhline(
+            limit, color=LIMIT, ls=":", lw=1.2, label=f"comfort limit {limit:g} {unit}/{scenario.plant.time_unit}"
+        )
+    axes.set_ylabel(f"|Δy| [{unit}/{scenario.plant.time_unit}]")
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(0, t[-1])
+
+
+def _finish(axes: Axes, scenario: Scenario, title: str = "", last: bool = True) -> None:
+    if title:
+        axes.set_title(title, fontsize=10, loc="left")
+    if last:
+        axes.set_xlabel(f"time [{scenario.plant.time_unit}]")
+    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
+
+
+def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> Path:
+    """r, y and r~ over time with the bounds: the inner loop alone beside the learned outer loop."""
+    rates = scenario.plant.rate_limit is not None
+    figure = Figure(figsize=(10, 8.4 if rates else 6), layout="constrained")
+    grid = figure.subplots(3 if rates else 2, 2, sharex=True, squeeze=False)
+    unit = _unit(scenario)
+    for column, (name, traces) in enumerate((("inner loop alone", inner), ("learned outer loop", learned))):
+        _houses(grid[0, column], scenario, traces)
+        _output(grid[0, column], scenario, traces, INNER if column == 0 else LEARNED, "output y")
+        _finish(grid[0, column], scenario, f"{name}: MAE {mae(traces):.3g} {unit}", last=False)
+        _modified(grid[1, column], scenario, traces)
+        _finish(grid[1, column], scenario, last=not rates)
+        if rates:
+            _changes(grid[2, column], scenario, traces)
+            _finish(grid[2, column], scenario)
+    figure.suptitle(scenario.id, fontsize=11)
+    return _save(figure, path)
+
+
+def paper(
+    path: Path, scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: Mapping[str, Traces]
+) -> Path:
+    """The paper's figure, (a) to (d), of a plant; of other plants (a) and (b) of the first scenario.
+
+    Pitch: inner loop and learned loop, nominal and delayed. Heaters: inner loop and learned loop with 4 houses, the
+    learned loop with 1000, and their change of temperature an hour.
+    """
+    heaters = scenarios[0].plant.members is not None
+    panels: list[tuple[Scenario, str, Traces]] = []
+    for scenario in scenarios:
+        both = [
+            (scenario, "inner loop alone", inner[scenario.id]),
+            (scenario, "learned outer loop", learned[scenario.id]),
+        ]
+        panels += both[1:] * 2 if heaters and panels else both
+    panels = panels[:4]
+    figure = Figure(figsize=(10, 3.4 * len(panels) / 2), layout="constrained")
+    grid = np.ravel(figure.subplots(len(panels) // 2, 2))
+    for axes, letter, (scenario, name, traces) in zip(grid, "abcd", panels, strict=False):
+        title = f"({letter}) {scenario.id}, {name}: MAE {mae(traces):.3g} {_unit(scenario)}"
+        if heaters and letter == "d":
+            _changes(axes, scenario, traces)
+            title = f"({letter}) {scenario.id}, {name}: change an hour"
+        else:
+            if name == "learned outer loop":
+                _houses(axes, scenario, traces)
+            _output(axes, scenario, traces, INNER if name == "inner loop alone" else LEARNED, "output y")
+            if name == "learned outer loop":
+                axes.step(
+                    _times(scenario, traces.r.shape[1])[:-1],
+                    traces.r_tilde[0],
+                    where="post",
+                    color=MODIFIED,
+                    lw=0.8,
+                    label="modified reference r̃",
+                )
+                axes.autoscale(axis="y")
+        _finish(axes, scenario, title)
+    return _save(figure, path)
+
+
+def learning_curve(
+    path: Path, rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapping[str, float], title: str
+) -> Path:
+    """MAE without exploration, and reward with it, over environment steps, a line a seed.
+
+    Args:
+        path: PNG.
+        rows: of metrics.jsonl, by seed; `mae` and `reward` are drawn.
+        levels: horizontal lines by name, such as the MAE of the static prefilter.
+        title: what the MAE is of.
+    """
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for seed, of_seed in rows.items():
+        steps = [row["steps"] / 1000 for row in of_seed]
+        left.plot(steps, [row["mae"] for row in of_seed], lw=1.6, label=f"learned, seed {seed}")
+        right.plot(steps, [row["reward"] for row in of_seed], lw=1.6, label=f"seed {seed}")
+    for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
+        left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
+    left.set_ylabel("MAE without exploration")
+    left.set_yscale("log")
+    left.set_title(title, fontsize=10, loc="left")
+    right.set_ylabel("reward a step, with exploration")
+    for axes in (left, right):
+        axes.set_xlabel("environment steps [thousand]")
+        axes.legend(fontsize=7.5, framealpha=0.85)
+    return _save(figure, path)

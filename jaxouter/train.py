@@ -1,0 +1,157 @@
+"""`python -m jaxouter.train`: learn an outer loop, and see what it is worth."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from jaxouter import cli
+from jaxouter.evaluation import figures, scenarios
+from jaxouter.evaluation.evaluate import Named, evaluate, result, simple_policy
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.training.config import TrainConfig, preset
+from jaxouter.training.run import FORMAT, Run, write_json
+from jaxouter.training.train import begin, train
+from jaxouter.training.trainer import Trainer, TrainState
+
+Results = dict[str, tuple[Traces, dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train an outer loop on a plant (pitch or heaters) and show what came out.
+
+    Without options the pitch plant is learned with the default preset. The preset sets every other field; what is
+    given here overrides it. `--list` prints plants, presets, scenarios and policies.
+    """
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    out: Path | None = None
+    """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
+    resume: Path | None = None
+    """Go on with the run in this folder; takes no other option."""
+    list: bool = False
+    """Print plants, presets, scenarios and policies, and end."""
+
+
+def parse(arguments: list[str]) -> Options:
+    """The options; plant and preset are read first, since they set the defaults of all others."""
+    program = "python -m jaxouter.train"
+    first = Options(preset("pitch"))
+    plain = [argument for argument in arguments if argument not in ("-h", "--help")]
+    config = tyro.cli(Options, prog=program, args=plain, default=first).config
+    options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(config.plant, config.preset)))
+    if options.resume is not None and options != dataclasses.replace(first, resume=options.resume):
+        raise ValueError("--resume takes no other option: the run folder holds them all")
+    return options
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    begun = time.perf_counter()
+    with cli.user_errors():
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+        if options.list:
+            return cli.print_lists()
+        cli.use_compilation_cache()
+        run = Run.open(options.resume) if options.resume else Run(Path(), options.config)
+        trainer, _ = run.trainer  # checks the configuration
+        run = run if options.resume else Run.create(options.config, options.out)
+        print(f"{run.config.plant}, preset {run.config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
+        with cli.Interrupt() as interrupt:
+            states = begin(run)
+            watched = scenarios.get(scenarios.paper_scenarios(run.config.plant)[0])
+
+            def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
+                return {"mae": mae(rollout(trainer.policy, trainer.policy_params(state), watched))}
+
+            with cli.TrainingProgress(run.config, trainer.env.plant.y_unit) as progress:
+                finals = train(run, states, watch, progress, lambda: interrupt.requested)
+    if finals is None:
+        print(f"saved; go on with: python -m jaxouter.train --resume {run.path}", file=sys.stderr)
+        raise SystemExit(130)
+    report(run, finals, begun)
+
+
+def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
+    """Evaluate on the paper's scenarios, write summary and figures, print the table."""
+    plant = run.config.plant
+    trainer, _ = run.trainer
+    met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
+    simple = {name: evaluate(simple_policy(name, plant), met) for name in ("none", "static")}
+    learned = {seed: evaluate(_named(trainer, state), met) for seed, state in finals.items()}
+    by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
+    median = by_mae[(len(by_mae) - 1) // 2]
+    summary = {
+        "format": FORMAT,
+        "median_seed": median,
+        "seconds": time.perf_counter() - begun,
+        "steps": run.config.steps,
+        "updates": run.config.total_updates,
+        "results": [result(_named(trainer, finals[seed]), r, seed=seed) for seed, r in learned.items()]
+        + [result(simple_policy(name, plant), r) for name, r in simple.items()],
+    }
+    write_json(run.path / "summary.json", summary)
+    main_figure = draw(run, met, simple, learned[median], finals[median])
+    show(run, met, simple, learned)
+    print(f"{summary['seconds']:.0f} s in all; run folder {run.path}, main figure {main_figure}")
+
+
+def _named(trainer: Trainer, state: TrainState) -> Named:
+    return Named("learned", trainer.policy, trainer.policy_params(state))
+
+
+def draw(
+    run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results, final: TrainState
+) -> Path:
+    """Write every figure; returns the main one."""
+    trainer, _ = run.trainer
+    named, inner = _named(trainer, final), simple_policy("none", run.config.plant)
+    if met[0].plant.members is not None:  # once more, with every house
+        one = [scenario.first() for scenario in met]
+        traces = {s.id: rollout(named.policy, named.params, s, record_members=True) for s in one}
+        inner_traces = {s.id: rollout(inner.policy, inner.params, s, record_members=True) for s in one}
+    else:
+        traces = {identifier: t for identifier, (t, _) in learned.items()}
+        inner_traces = {identifier: t for identifier, (t, _) in simple["none"].items()}
+    for scenario in met:
+        name = scenario.id.replace("/", "-")
+        figures.response(run.figures / f"{name}.png", scenario, inner_traces[scenario.id], traces[scenario.id])
+    levels = {name: r[met[0].id][1]["mae"] for name, r in simple.items()}
+    levels |= {"paper's DRL": met[0].paper[1]} if met[0].paper else {}
+    rows = {seed: run.rows(seed) for seed in run.seeds}
+    title = f"{met[0].id}, MAE [{met[0].plant.y_unit}]"
+    figures.learning_curve(run.figures / "learning-curve.png", rows, levels, title)
+    return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
+
+
+def show(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: dict[int, Results]) -> None:
+    """Print the table; with several seeds the median, least and largest MAE."""
+    rows = []
+    for scenario in met:
+        of_seeds = [results[scenario.id][1] for results in learned.values()]
+        values = [figures["mae"] for figures in of_seeds if figures["mae"] is not None]
+        ours = cli.number(statistics.median(values)) if len(values) == len(of_seeds) else "diverged"
+        if len(values) > 1:
+            ours += f" ({min(values):.3f}-{max(values):.3f})"
+        better = [figures["improvement"] for figures in of_seeds if figures["improvement"] is not None]
+        paper = "-" if scenario.paper is None else f"{scenario.paper[1]:.2f} of {scenario.paper[0]:.2f}"
+        inner, static = (simple[name][scenario.id][1]["mae"] for name in ("none", "static"))
+        improvement = cli.number(statistics.median(better), 1) if better else "-"
+        rows.append([scenario.id, cli.number(inner), cli.number(static), paper, ours, improvement])
+    unit = met[0].plant.y_unit
+    columns = ["scenario", "inner loop alone", "static prefilter", "paper's DRL", "ours", "improvement, %"]
+    cli.table(f"MAE in {unit}", columns, rows)
+
+
+if __name__ == "__main__":
+    main()
