@@ -57,7 +57,7 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
         ValueError: the file is not readable, damaged, of another format or of another configuration.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             arrays = {name: file[name] for name in file.files if name != "header"}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

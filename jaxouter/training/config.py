@@ -113,11 +113,12 @@ DEFAULT = TrainConfig(
     updates=4,
     prefill=8_000,
     replay=200_000,
-    epoch=6_400,
+    epoch=6_000,
     residual=True,
     reward_scale=0.1,
     noise_theta=0.15,
     noise_sigma=(0.0125, 0.1),
+    integral_steps=20.0,
     ddpg=DDPGConfig(
         hidden=(128, 128),
         layer_norm=True,
@@ -126,9 +127,9 @@ DEFAULT = TrainConfig(
         rate_decay="cosine",
         critic_l2=0.0,
         batch_size=256,
-        discount=0.97,
+        discount=0.98,
         polyak=0.005,
-        saturation_penalty=1e-3,
+        saturation_penalty=3e-3,
     ),
 )
 PRESETS: dict[str, dict[str, TrainConfig]] = {

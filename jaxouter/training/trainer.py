@@ -6,7 +6,7 @@ donated. Plain Python between them draws progress, evaluates and saves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -208,4 +208,5 @@ def build(config: TrainConfig) -> tuple[Trainer, EnvParams]:
     learner = DDPG(config.ddpg, env.observer.size, total_updates=config.total_updates)
     per_environment = min(config.replay, config.steps) // config.environments  # it never holds more than there is
     replay = Replay(FIELDS, config.environments, per_environment, env.observer.history, config.ddpg.n_step)
+    config = replace(config, seed=0, seeds=1)  # the functions are the same for all seeds, and compiled once
     return Trainer(config, env, LearnedPolicy(env.observer, learner), replay), params

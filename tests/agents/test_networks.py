@@ -1,0 +1,41 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.agents.networks import Actor, Critic
+
+
+def test_layers_are_those_of_the_paper():
+    obs, action = jnp.zeros(33), jnp.zeros(1)
+    actor = Actor((400, 300), 1).init(jax.random.key(0), obs)["params"]
+    critic = Critic((400, 300), False).init(jax.random.key(0), obs, action)["params"]
+    chex.assert_shape([actor[f"Dense_{i}"]["kernel"] for i in range(3)], [(33, 400), (400, 300), (300, 1)])
+    chex.assert_shape([critic[f"Dense_{i}"]["kernel"] for i in range(3)], [(33, 400), (401, 300), (300, 1)])
+
+
+def test_initial_weights_are_uniform_in_fan_in_and_small_at_the_end():
+    params = Actor((400, 300), 1).init(jax.random.key(1), jnp.zeros(33))["params"]
+    for i, bound in enumerate((33**-0.5, 400**-0.5, 3e-3)):
+        kernel = np.asarray(params[f"Dense_{i}"]["kernel"])
+        assert np.abs(kernel).max() <= bound
+        assert np.abs(kernel).max() > 0.95 * bound
+
+
+def test_first_critic_layer_does_not_see_the_action():
+    critic = Critic((8, 8), False)
+    obs, action = jnp.ones(3), jnp.ones(1)
+    params = critic.init(jax.random.key(0), obs, action)
+    blind = jax.tree.map(jnp.copy, params)
+    blind["params"]["Dense_1"]["kernel"] = blind["params"]["Dense_1"]["kernel"].at[-1].set(0.0)  # the action's row
+    assert critic.apply(params, obs, action) != critic.apply(params, obs, -action)
+    assert critic.apply(blind, obs, action) == critic.apply(blind, obs, -action)
+
+
+def test_layer_norm_makes_the_critic_independent_of_the_scale_of_its_first_layer():
+    critic = Critic((8, 8), True)
+    obs, action = jnp.array([1.0, -2.0, 0.5]), jnp.ones(1)
+    params = critic.init(jax.random.key(0), obs, action)
+    scaled = jax.tree.map(jnp.copy, params)
+    scaled["params"]["Dense_0"] = jax.tree.map(lambda leaf: 10.0 * leaf, scaled["params"]["Dense_0"])
+    chex.assert_trees_all_close(critic.apply(params, obs, action), critic.apply(scaled, obs, action), atol=1e-5)

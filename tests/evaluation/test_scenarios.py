@@ -1,0 +1,106 @@
+import chex
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import rollout
+from jaxouter.loop.policy import none
+from jaxouter.plants import make
+
+PITCH = "paper delay-0.57 delay-5.7 delay-swapped uncertainty load noise steps staircase ramps sines doublets"
+HEATERS = "paper-4 paper-1000 riccati cold mixed-stock load noise steps staircase ramps days"
+
+
+@pytest.mark.parametrize(("plant", "names"), [("pitch", PITCH), ("heaters", HEATERS)])
+def test_catalogue_is_the_specifications(plant, names):
+    assert set(scenarios.catalogue(plant)) == {f"{plant}/{name}" for name in names.split()}
+
+
+@pytest.mark.parametrize(
+    ("identifier", "expected"),
+    [
+        ("pitch/paper", 10.907),
+        ("pitch/delay-0.57", 10.909),
+        ("pitch/delay-5.7", 27.199),
+        ("pitch/delay-swapped", 8.837),
+        ("pitch/uncertainty", 136.2),
+    ],
+)
+def test_inner_loop_alone_has_the_specified_mae_on_pitch(identifier, expected):
+    scenario = scenarios.get(identifier)
+    assert mae(rollout(*none(scenario.plant), scenario)) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(("identifier", "expected"), [("heaters/paper-4", 15.6), ("heaters/paper-1000", 15.07)])
+def test_inner_loop_alone_has_the_specified_mae_on_heaters(identifier, expected):
+    scenario = scenarios.get(identifier)
+    traces = rollout(*none(scenario.plant), scenario)
+    assert traces.y.shape == (32, 200)
+    assert mae(traces) == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "episodes", "steps"),
+    [("pitch/steps", 64, 200), ("pitch/sines", 64, 600), ("heaters/days", 64, 200), ("pitch/noise", 32, 200)],
+)
+def test_families_have_64_members_and_noisy_scenarios_32_seeds(identifier, episodes, steps):
+    chex.assert_shape(scenarios.get(identifier).r, (episodes, steps))
+
+
+def test_families_are_drawn_from_their_seed():
+    first, again, other = (scenarios.get("pitch/staircase", 4, seed).r for seed in (2024, 2024, 7))
+    chex.assert_trees_all_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_houses_start_at_the_given_mean_and_are_not_alike():
+    scenario = scenarios.get("heaters/paper-1000", 2)
+    traces = rollout(*none(scenario.plant), scenario, record_members=True)
+    np.testing.assert_allclose(traces.y0, 17.8, atol=1e-4)
+    chex.assert_shape(traces.members, (2, 200, 1000))
+    assert np.ptp(traces.members[0, 0]) > 1.5
+
+
+def test_parameters_change_half_way_under_load():
+    calm, load = scenarios.get("pitch/paper"), scenarios.get("pitch/load")
+    a, b = (rollout(*none(s.plant), s).y[0] for s in (calm, load))
+    np.testing.assert_array_equal(a[:100], b[:100])
+    assert abs(a[120] - b[120]) > 0.1
+
+
+def test_mixed_stock_differs_from_house_to_house_within_30_percent():
+    house = scenarios.get("heaters/mixed-stock").params.house
+    for values, nominal in ((house.Ca, 10.0), (house.Ua, 0.2)):
+        chex.assert_shape(values, (32, 4))
+        assert float(jnp.ptp(values / nominal)) > 0.5
+        assert float(jnp.max(jnp.abs(values / nominal - 1))) <= 0.3 + 1e-6
+
+
+def test_sensor_noise_does_not_touch_the_metrics_of_a_policy_that_ignores_y():
+    clean, noisy = scenarios.get("pitch/paper"), scenarios.get("pitch/noise", 1)
+    assert mae(rollout(*none(clean.plant), clean)) == mae(rollout(*none(noisy.plant), noisy))
+
+
+def test_plant_without_scenarios_has_its_families(monkeypatch):
+    from jaxouter.plants import REGISTRY
+    from tests import lag
+
+    monkeypatch.setitem(REGISTRY, "lag", lag.make)
+    assert list(scenarios.catalogue("lag")) == ["lag/steps", "lag/staircase", "lag/ramps"]
+    scenario = scenarios.get("lag/staircase", 3)
+    chex.assert_shape(rollout(*none(scenario.plant), scenario).y, (3, 100))
+
+
+def test_unknown_scenario_lists_those_that_exist():
+    with pytest.raises(ValueError, match="no scenario 'pitch/papers'; pitch has: pitch/paper, "):
+        scenarios.get("pitch/papers")
+
+
+def test_first_keeps_one_episode():
+    scenario = scenarios.get("heaters/load").first()
+    whole = scenarios.get("heaters/load")
+    one = rollout(*none(scenario.plant), scenario)
+    np.testing.assert_allclose(one.y[0], rollout(*none(whole.plant), whole).y[0], rtol=1e-5)
+    assert make("heaters")[0] is scenario.plant

@@ -1,0 +1,220 @@
+"""The commands as users call them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxouter import evaluate, train
+from jaxouter.plants import REGISTRY
+from jaxouter.training.config import to_dict
+from jaxouter.training.run import Run
+from tests import lag
+from tests.training.small import small
+
+SMALL = ["--steps", "1600", "--prefill", "640", "--epoch", "480", "--environments", "8", "--replay", "1600"]
+SMALL += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
+
+
+def command(module: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", f"jaxouter.{module}", *arguments], cwd=cwd, capture_output=True, text=True, timeout=250
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Output and folder of a small run of two seeds on the heaters, through the real entry point."""
+    folder = tmp_path_factory.mktemp("train")
+    done = command("train", "heaters", *SMALL, "--seed", "3", "--seeds", "2", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done, folder / "runs" / "heaters-default-3"
+
+
+def test_train_writes_the_run_folder(trained):
+    _, folder = trained
+    config = json.loads((folder / "config.json").read_text())["config"]
+    assert (config["plant"], config["steps"], config["seeds"]) == ("heaters", 1600, 2)
+    assert config["ddpg"]["discount"] == 0.95  # of the preset
+    for seed in (3, 4):
+        rows = [json.loads(line) for line in (folder / f"seed-{seed}" / "metrics.jsonl").read_text().splitlines()]
+        assert [row["steps"] for row in rows] == [1120, 1600]
+        assert {"mae", "reward", "critic_loss", "updates_per_second", "steps_per_second"} <= set(rows[0])
+    names = {path.name for path in (folder / "figures").iterdir()}
+    assert names == {"paper.png", "learning-curve.png", "heaters-paper-4.png", "heaters-paper-1000.png"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert [(r["policy"], r.get("seed")) for r in summary["results"]] == [
+        ("learned", 3), ("learned", 4), ("none", None), ("static", None)
+    ]  # fmt: skip
+
+
+def test_train_ends_with_the_table_and_the_main_figure(trained):
+    done, folder = trained
+    for text in ("heaters/paper-4", "heaters/paper-1000", "inner loop", "static", "1.17 of 15.62", "15.59"):
+        assert text in done.stdout
+    assert done.stdout.rstrip().endswith(str(Path("runs") / folder.name / "figures" / "paper.png"))
+    assert "updates (" in done.stdout  # plain lines of progress where there is no terminal
+
+
+def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):
+    _, folder = trained
+    maes = {}
+    for name, path in (("run", folder), ("seed-3", folder / "seed-3"), ("seed-4", folder / "seed-4")):
+        out = tmp_path / f"{name}.json"
+        evaluate.main([str(path), "--scenario", "heaters/paper-4", "--json", str(out)])
+        content = json.loads(out.read_text())
+        assert content["policy"] == "learned"
+        maes[name] = content["scenarios"]["heaters/paper-4"]["mae"]
+    summary = json.loads((folder / "summary.json").read_text())
+    expected = [result["scenarios"]["heaters/paper-4"]["mae"] for result in summary["results"][:2]]
+    assert [maes["seed-3"], maes["seed-4"]] == pytest.approx(expected, rel=1e-4)
+    assert maes["run"] == pytest.approx(min(expected), rel=1e-4)
+
+
+def test_evaluate_through_its_entry_point_writes_figures_and_traces(tmp_path):
+    options = ["--policy", "static", "--scenario", "pitch/paper", "pitch/staircase", "--episodes", "2"]
+    done = command("evaluate", *options, "--json", "out.json", "--traces", "out.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert content["policy"] == "static"
+    assert content["scenarios"]["pitch/paper"]["mae"] == pytest.approx(3.404, abs=0.01)
+    with np.load(tmp_path / "out.npz") as arrays:
+        assert arrays["pitch/staircase/r_tilde"].shape == (2, 600)
+        assert len(arrays.files) == 6
+
+
+def test_list_names_plants_presets_scenarios_and_policies(capsys):
+    train.main(["--list"])
+    out = capsys.readouterr().out
+    for text in ("pitch", "heaters", "paper", "default", "pitch/doublets", "static"):
+        assert text in out
+
+
+@pytest.mark.parametrize(("plant", "default"), [("pitch", "128000"), ("heaters", "0.95")])
+def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
+    with pytest.raises(SystemExit) as end:
+        train.main([plant, "--help"])
+    assert end.value.code == 0
+    assert default in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["submarine"], "no plant 'submarine'; the plants are: pitch, heaters"),
+        (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, paper"),
+        (["--steps", "-5"], "steps is -5; it must be positive"),
+        (["--seeds", "0"], "seeds is 0; it must be positive"),
+        (["--replay", "100"], "replay is 100; it must hold at least a batch of 256"),
+        (["--no-such-option", "1"], "--no-such-option"),
+        (["--steps", "many"], "--steps"),
+        (["--out", "."], "exists; choose another --out"),
+        (["--resume", "."], "is not a run folder"),
+        (["--resume", ".", "--steps", "5"], "--resume takes no other option"),
+        (["--history", "0"], "history is 0"),
+    ],
+)
+def test_bad_input_to_train_is_one_message_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        train.main(arguments)
+    assert end.value.code == 2
+    captured = capsys.readouterr()
+    assert text in " ".join((captured.out + captured.err).split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ([], "say what to evaluate"),
+        (["."], "is not a run folder"),
+        (["--policy", "best"], "no policy 'best'; the policies are: none, static"),
+        (["--policy", "none", "--scenario", "pitch/papers"], "no scenario 'pitch/papers'"),
+        (["--policy", "none", "--scenario", "boat/paper"], "no plant 'boat'"),
+        (["--policy", "none", "--episodes", "0"], "--episodes is 0; it must be at least 1"),
+        (["--policy", "none", "--family-seed", "-1"], "--family-seed is -1"),
+        (["--policy", "none", "--json", "nowhere/out.json"], "can't be written"),
+    ],
+)
+def test_bad_input_to_evaluate_is_one_message_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        evaluate.main(arguments)
+    assert end.value.code == 2
+    assert text in capsys.readouterr().err
+
+
+def test_bad_input_leaves_no_traceback(tmp_path):
+    done = command("train", "submarine", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: there is no plant 'submarine'")
+    assert "Traceback" not in done.stderr
+
+
+def test_run_without_or_with_a_damaged_checkpoint_is_refused(tmp_path, capsys):
+    run = Run.create(small(), tmp_path / "run")
+    path = run.seed_folder(0) / "checkpoint-000001.npz"
+    for content, text in ((None, "has no checkpoint yet"), (b"junk", "is not a readable checkpoint")):
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(SystemExit) as end:
+            evaluate.main([str(run.path)])
+        assert end.value.code == 2
+        assert text in capsys.readouterr().err
+
+
+def test_run_of_one_plant_is_not_evaluated_on_another(trained, capsys):
+    with pytest.raises(SystemExit):
+        evaluate.main([str(trained[1]), "--scenario", "pitch/paper"])
+    assert "is a run on heaters; pitch/paper is another plant's" in capsys.readouterr().err
+
+
+def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
+    long = ["--steps", "400640", "--epoch", "4000", "--out", "run"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jaxouter.train", "heaters", *SMALL, *long],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    metrics = tmp_path / "run" / "seed-0" / "metrics.jsonl"
+    deadline = time.monotonic() + 200
+    while not (metrics.exists() and metrics.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode == 130, errors
+    assert "python -m jaxouter.train --resume run" in errors
+    run = Run.open(tmp_path / "run")
+    done = len(run.rows(0))
+    assert 0 < done < run.config.epochs
+    assert run.load(0)[1] == done
+
+
+def test_resume_of_a_finished_run_only_shows_it_again(trained, capsys):
+    _, folder = trained
+    before = (folder / "seed-3" / "metrics.jsonl").read_text()
+    train.main(["--resume", str(folder)])
+    assert "heaters/paper-1000" in capsys.readouterr().out
+    assert (folder / "seed-3" / "metrics.jsonl").read_text() == before
+
+
+def test_third_plant_goes_through_the_whole_of_training(tmp_path, monkeypatch, capsys):
+    """Registered by one line, the lag with a delay is learned, and beats the inner loop and the static prefilter."""
+    monkeypatch.setitem(REGISTRY, "lag", lag.make)
+    out = tmp_path / "run"
+    train.main(["lag", "--steps", "16640", "--prefill", "640", "--epoch", "3200", "--out", str(out)])
+    assert to_dict(Run.open(out).config)["plant"] == "lag"
+    results = json.loads((out / "summary.json").read_text())["results"]
+    maes = {result["policy"]: result["scenarios"]["lag/steps"]["mae"] for result in results}
+    assert maes["learned"] < maes["static"] < maes["none"]
+    assert "lag/ramps" in capsys.readouterr().out
+    assert (out / "figures" / "paper.png").stat().st_size > 10_000

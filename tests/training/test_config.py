@@ -1,0 +1,56 @@
+import json
+from dataclasses import replace
+
+import pytest
+
+from jaxouter.training.config import PRESETS, from_dict, preset, to_dict
+
+EVERY = [(plant, name) for plant, presets in PRESETS.items() for name in presets]
+
+
+@pytest.mark.parametrize(("plant", "name"), EVERY)
+def test_presets_are_sound_and_survive_json(plant, name):
+    config = preset(plant, name).check()
+    assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
+
+
+@pytest.mark.parametrize(("plant", "steps"), [("pitch", 1000 * 200), ("heaters", 2000 * 200)])
+def test_paper_preset_is_the_papers(plant, steps):
+    config = preset(plant, "paper")
+    assert (config.steps, config.environments, config.updates, config.replay) == (steps, 1, 1, 1_000_000)
+    assert (config.noise_theta, config.noise_sigma, config.residual, config.redraw) == (0.15, (0.2, 0.2), False, 0.0)
+    assert config.total_updates == steps - config.prefill
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"plant": "submarine"}, "no plant 'submarine'; the plants are: pitch, heaters"),
+        ({"steps": -1}, "steps is -1; it must be positive"),
+        ({"seeds": 0}, "seeds is 0; it must be positive"),
+        ({"seed": -1}, "seed is -1; it must not be negative"),
+        ({"epoch": 100}, "epoch is 100; it must be a multiple of the 16 environments"),
+        ({"replay": 100}, "replay is 100; it must hold at least a batch of 256"),
+        ({"prefill": 160}, "prefill is 160; it must lie between the batch size, 256, and the"),
+        ({"redraw": 1.5}, "redraw is 1.5"),
+        ({"noise_sigma": (0.0, 0.1)}, r"noise_sigma is \(0.0, 0.1\)"),
+    ],
+)
+def test_errors_name_field_value_and_what_is_allowed(change, text):
+    with pytest.raises(ValueError, match=text):
+        replace(preset("pitch"), **change).check()
+
+
+def test_unknown_preset_lists_those_that_exist():
+    with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, paper"):
+        preset("heaters", "fast")
+
+
+def test_configuration_with_an_unknown_field_is_refused():
+    with pytest.raises(ValueError, match="speed"):
+        from_dict({**to_dict(preset("pitch")), "speed": 3})
+
+
+def test_last_epoch_may_be_shorter():
+    config = replace(preset("pitch"), steps=8_000 + 6_400 + 160, prefill=8_000, epoch=6_400)
+    assert config.epochs == 2

@@ -1,0 +1,146 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxouter.training.trainer import FIELDS, build
+from tests.training.small import small
+
+
+@pytest.fixture(scope="module")
+def filled():
+    """Trainer, parameters and a state after the prefill."""
+    trainer, params = build(small())
+    return trainer, params, trainer.prefill(trainer.start(0, params), params)
+
+
+def copy(state):
+    return jax.tree.map(jnp.copy, state)
+
+
+def test_prefill_fills_and_does_not_learn(filled):
+    trainer, params, state = filled
+    assert int(state.steps) == 640
+    assert int(state.replay.written) == 640 // 8
+    assert int(state.learner.updates) == 0
+    chex.assert_trees_all_equal(state.learner, trainer.start(0, params).learner)
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_batches_hold_the_observations_that_the_environment_gave(n_step):
+    """Windows of signals rebuild exactly what was seen, across resets, truncation and the ring's end included."""
+    trainer, params = build(small(n_step=n_step, epoch=800, steps=1_600, replay=960))
+    state = trainer.start(0, params)
+    step = jax.jit(trainer.vector_step)
+
+    @jax.jit
+    def without_reset(state, action, key):
+        keys = jax.vmap(lambda k: jax.random.split(k)[0])(jax.random.split(key, 8))  # as Environment.step splits them
+        r_tilde = jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(state.prior, state.env.r, action)
+        return jax.vmap(trainer.env.step_env, (0, 0, 0, None))(keys, state.env, r_tilde, params)
+
+    seen = []  # (obs, action, reward, terminated, truncated, final observation) of each step
+    for t in range(215):
+        key = jax.random.key(t)
+        action = jax.random.uniform(key, (8,), minval=-1.0)
+        before = state.obs
+        final = without_reset(state, action, key)
+        state, reward, _ = step(state, params, action, key)
+        seen.append((before, action, reward, final[3], final[4], final[5]["final_observation"]))
+    assert any(bool(ended.any()) for *_, ended, _ in seen)
+    obs, action, reward, terminated, truncated, final = (np.asarray(jnp.stack(x)) for x in zip(*seen, strict=True))
+    gamma = trainer.config.ddpg.discount
+
+    batch = trainer.batch(state.replay, jax.random.key(0))
+    rows, _ = trainer.replay.sample(state.replay, jax.random.key(0), trainer.config.ddpg.batch_size)
+    for i, row in enumerate(np.asarray(rows)):
+        match = np.argwhere(np.isclose(action, row[trainer.replay.lead, FIELDS.index("action")], rtol=0, atol=0))
+        t, e = match[0]
+        total, k = reward[t, e], 0
+        while k < n_step - 1 and not (terminated | truncated)[t + k, e]:
+            k += 1
+            total += gamma**k * reward[t + k, e]
+        np.testing.assert_allclose(batch.obs[i], obs[t, e], atol=1e-5)
+        np.testing.assert_allclose(batch.next_obs[i], final[t + k, e], atol=1e-5)
+        np.testing.assert_allclose(batch.reward[i], total * trainer.config.reward_scale, rtol=1e-4)
+        assert float(batch.discount[i]) == pytest.approx(0.0 if terminated[t + k, e] else gamma ** (k + 1))
+
+
+def test_scan_equals_a_python_loop(filled):
+    """One epoch of 5 steps equals 5 epochs of one step."""
+    trainer, params, state = filled
+    scanned, _ = trainer.epoch(copy(state), params, 40)
+    looped = copy(state)
+    for _ in range(5):
+        looped, _ = trainer.epoch(looped, params, 8)
+    chex.assert_trees_all_close(scanned.learner, looped.learner, atol=1e-6)
+    chex.assert_trees_all_close(scanned.replay, looped.replay, atol=1e-5)
+    chex.assert_trees_all_equal(scanned.steps, looped.steps)
+
+
+def test_epochs_of_one_length_are_compiled_once(filled):
+    trainer, params, state = filled
+    with jax.log_compiles(False):
+        state, _ = trainer.epoch(copy(state), params, 80)
+        before = trainer.epoch._cache_size()
+        for seed in (1, 2):
+            state, _ = trainer.epoch(state, params, 80)
+            fresh = trainer.prefill(trainer.start(seed, params), params)
+            trainer.epoch(fresh, params, 80)
+    assert trainer.epoch._cache_size() == before
+
+
+def test_same_seed_twice_is_bit_equal_and_another_seed_is_not():
+    trainer, params = build(small())
+    first, second, other = (
+        trainer.epoch(trainer.prefill(trainer.start(seed, params), params), params, 80)[0] for seed in (0, 0, 1)
+    )
+    chex.assert_trees_all_equal(first.learner, second.learner)
+    chex.assert_trees_all_equal(first.replay, second.replay)
+    assert not np.array_equal(jax.tree.leaves(first.learner.actor)[0], jax.tree.leaves(other.learner.actor)[0])
+
+
+def test_vmapped_seeds_equal_single_runs():
+    trainer, params = build(small())
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    states = jax.vmap(trainer.fresh, (0, None))(keys, params)
+    both = jax.vmap(lambda s: trainer.epoch(trainer.prefill(s, params), params, 80)[0])(states)
+    for i in range(2):
+        one = trainer.fresh(keys[i], params)
+        one, _ = trainer.epoch(trainer.prefill(one, params), params, 80)
+        lane = jax.tree.map(lambda leaf, i=i: leaf[i], both.learner)
+        chex.assert_trees_all_close(lane, one.learner, atol=1e-4)
+
+
+def test_compiled_epoch_copies_no_replay_inside_its_loop(filled):
+    trainer, params, state = filled
+    text = trainer.epoch.lower(trainer, state, params, 80).compile().as_text()
+    shape = ",".join(map(str, state.replay.rows.shape))
+    copies = [line for line in text.splitlines() if " copy(" in line and f"f32[{shape}]" in line]
+    assert len(copies) <= 1  # where the loop begins, once an epoch
+
+
+def test_exploration_stays_within_the_bounds_of_r_tilde():
+    loud, params = build(small(noise_sigma=(3.0, 3.0)))
+    state, _ = loud.epoch(loud.prefill(loud.start(0, params), params), params, 960)
+    r_tilde = state.replay.rows[:, :, FIELDS.index("r_tilde")]
+    assert float(r_tilde.min()) == 0.0
+    assert float(r_tilde.max()) == 40.0
+
+
+def test_residual_starts_at_the_static_prefilter():
+    trainer, params = build(small("pitch", residual=True))
+    state = trainer.start(0, params)
+    assert float(state.prior.slope) == pytest.approx(3.0, rel=0.02)
+    r_tilde = trainer.policy.r_tilde(state.prior, jnp.array(10.0), jnp.array(0.0))
+    assert float(r_tilde) == pytest.approx(30.0, rel=0.02)
+
+
+def test_set_points_are_redrawn_within_an_episode_only_where_asked():
+    for redraw, changes in ((0.0, False), (0.5, True)):
+        trainer, params = build(small(redraw=redraw))
+        rows = trainer.prefill(trainer.start(0, params), params).replay.rows[:, trainer.replay.mirror :][:, :80]
+        r, age = rows[..., FIELDS.index("r")], rows[..., FIELDS.index("age")]
+        within = (age[:, 1:] > 0) & (r[:, 1:] != r[:, :-1])
+        assert bool(within.any()) == changes
