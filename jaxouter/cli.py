@@ -22,7 +22,7 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.evaluate import SIMPLE
 from jaxouter.training.config import PRESETS, TrainConfig
 
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
 LINE_SECONDS = 5.0  # between two plain lines of progress
 
 

@@ -12,8 +12,7 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import SIMPLE, Named, evaluate, result, simple_policy
-from jaxouter.evaluation.rollout import Traces
+from jaxouter.evaluation.evaluate import SIMPLE, Named, Results, evaluate, result, simple_policy
 from jaxouter.training.run import Run, write_json
 
 SHOWN = (
@@ -68,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if foreign:
             raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
 
-    results: dict[str, tuple[Traces, dict[str, Any]]] = {}
+    results: Results = {}
     with cli.console.status("") as status:
         for i, name in enumerate(names):
             status.update(f"{name} ({i + 1} of {len(names)})")
@@ -143,7 +142,7 @@ def open_run(path: Path) -> tuple[Run, int]:
     return run, run.median_seed()
 
 
-def show(policy: str, results: dict[str, tuple[Traces, dict[str, Any]]]) -> None:
+def show(policy: str, results: Results) -> None:
     """Print the table."""
     rows = [
         [name, *("diverged" if figures.get("diverged") else cli.number(figures[key]) for key in SHOWN)]

@@ -8,22 +8,20 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import Named, evaluate, result, simple_policy
+from jaxouter.evaluation.evaluate import SIMPLE, Named, Results, evaluate, result, simple_policy
 from jaxouter.evaluation.metrics import mae
-from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.evaluation.rollout import rollout
 from jaxouter.training.config import TrainConfig, preset
 from jaxouter.training.run import FORMAT, Run, write_json
 from jaxouter.training.train import begin, train
 from jaxouter.training.trainer import Trainer, TrainState
-
-Results = dict[str, tuple[Traces, dict[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,9 @@ def main(arguments: list[str] | None = None) -> None:
             watched = scenarios.get(scenarios.paper_scenarios(run.config.plant)[0])
 
             def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
-                return {"mae": mae(rollout(trainer.policy, trainer.policy_params(state), watched))}
+                # With the single outputs only because the report asks for them too, in the same compiled function.
+                traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
+                return {"mae": mae(traces)}
 
             with cli.TrainingProgress(run.config, trainer.env.plant.y_unit) as progress:
                 finals = train(run, states, watch, progress, lambda: interrupt.requested)
@@ -84,49 +84,36 @@ def main(arguments: list[str] | None = None) -> None:
 
 def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
-    plant = run.config.plant
-    trainer, _ = run.trainer
+    plant, (trainer, _) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
-    simple = {name: evaluate(simple_policy(name, plant), met) for name in ("none", "static")}
-    learned = {seed: evaluate(_named(trainer, state), met) for seed, state in finals.items()}
+    simple = {name: simple_policy(name, plant) for name in SIMPLE}
+    policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
+    simple_results = {name: evaluate(named, met, record_members=True) for name, named in simple.items()}
+    learned = {seed: evaluate(named, met, record_members=True) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
+    main_figure = draw(run, met, simple_results, learned[median])
     summary = {
         "format": FORMAT,
         "median_seed": median,
         "seconds": time.perf_counter() - begun,
         "steps": run.config.steps,
         "updates": run.config.total_updates,
-        "results": [result(_named(trainer, finals[seed]), r, seed=seed) for seed, r in learned.items()]
-        + [result(simple_policy(name, plant), r) for name, r in simple.items()],
+        "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
+        + [result(simple[name], results) for name, results in simple_results.items()],
     }
     write_json(run.path / "summary.json", summary)
-    main_figure = draw(run, met, simple, learned[median], finals[median])
-    show(run, met, simple, learned)
+    show(met, simple_results, learned)
     print(f"{summary['seconds']:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 
-def _named(trainer: Trainer, state: TrainState) -> Named:
-    return Named("learned", trainer.policy, trainer.policy_params(state))
-
-
-def draw(
-    run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results, final: TrainState
-) -> Path:
+def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results) -> Path:
     """Write every figure; returns the main one."""
-    trainer, _ = run.trainer
-    named, inner = _named(trainer, final), simple_policy("none", run.config.plant)
-    if met[0].plant.members is not None:  # once more, with every house
-        one = [scenario.first() for scenario in met]
-        traces = {s.id: rollout(named.policy, named.params, s, record_members=True) for s in one}
-        inner_traces = {s.id: rollout(inner.policy, inner.params, s, record_members=True) for s in one}
-    else:
-        traces = {identifier: t for identifier, (t, _) in learned.items()}
-        inner_traces = {identifier: t for identifier, (t, _) in simple["none"].items()}
+    inner_traces, traces = ({name: t for name, (t, _) in results.items()} for results in (simple["none"], learned))
     for scenario in met:
         name = scenario.id.replace("/", "-")
         figures.response(run.figures / f"{name}.png", scenario, inner_traces[scenario.id], traces[scenario.id])
-    levels = {name: r[met[0].id][1]["mae"] for name, r in simple.items()}
+    levels = {name: results[met[0].id][1]["mae"] for name, results in simple.items()}
     levels |= {"paper's DRL": met[0].paper[1]} if met[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
     title = f"{met[0].id}, MAE [{met[0].plant.y_unit}]"
@@ -134,7 +121,7 @@ def draw(
     return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
 
 
-def show(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: dict[int, Results]) -> None:
+def show(met: list[scenarios.Scenario], simple: dict[str, Results], learned: dict[int, Results]) -> None:
     """Print the table; with several seeds the median, least and largest MAE."""
     rows = []
     for scenario in met:

@@ -56,7 +56,14 @@ def test_train_writes_the_run_folder(trained):
 
 def test_train_ends_with_the_table_and_the_main_figure(trained):
     done, folder = trained
-    for text in ("heaters/paper-4", "heaters/paper-1000", "inner loop", "static", "1.17 of 15.62", "15.59"):
+    for text in (
+        "heaters/paper-4",
+        "heaters/paper-1000",
+        "inner loop alone",
+        "static prefilter",
+        "1.17 of 15.62",
+        "15.59",
+    ):
         assert text in done.stdout
     assert done.stdout.rstrip().endswith(str(Path("runs") / folder.name / "figures" / "paper.png"))
     assert "updates (" in done.stdout  # plain lines of progress where there is no terminal

@@ -16,6 +16,7 @@ from jaxouter.loop.policy import Policy, none
 from jaxouter.plants import make
 
 SIMPLE = ("none", "static")
+Results = dict[str, tuple[Traces, dict[str, Any]]]  # by the scenario's id
 
 
 @dataclass(frozen=True)
@@ -41,17 +42,17 @@ def simple_policy(name: str, plant_name: str) -> Named:
     raise ValueError(f"there is no policy {name!r}; the policies are: {', '.join(SIMPLE)}")
 
 
-def evaluate(named: Named, scenarios: Iterable[Scenario]) -> dict[str, tuple[Traces, dict[str, Any]]]:
-    """Traces and figures of merit on each scenario, by id."""
+def evaluate(named: Named, scenarios: Iterable[Scenario], record_members: bool = False) -> Results:
+    """Traces (with the single outputs where asked for) and figures of merit on each scenario."""
     results = {}
     for scenario in scenarios:
-        traces = rollout(named.policy, named.params, scenario)
-        inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario)
+        traces = rollout(named.policy, named.params, scenario, record_members)
+        inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario, record_members)
         results[scenario.id] = traces, figures_of_merit(traces, scenario, mae(inner))
     return results
 
 
-def result(named: Named, results: dict[str, tuple[Traces, dict[str, Any]]], **extra: Any) -> dict[str, Any]:
+def result(named: Named, results: Results, **extra: Any) -> dict[str, Any]:
     """The evaluation as JSON values."""
     scenarios = {identifier: figures for identifier, (_, figures) in results.items()}
     return {"policy": named.name, **extra, "scenarios": scenarios}

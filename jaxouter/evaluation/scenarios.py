@@ -39,12 +39,6 @@ class Scenario:
     sensor: SensorParams = field(default_factory=sensors.params)
     paper: tuple[float, float] | None = None  # MAE in the paper: inner loop alone, its DRL
 
-    def first(self) -> Scenario:
-        """The first episode alone."""
-        cut = lambda tree: jax.tree.map(lambda leaf: leaf[:1], tree)  # noqa: E731
-        change = None if self.change is None else (self.change[0], cut(self.change[1]))
-        return replace(self, params=cut(self.params), r=self.r[:1], keys=self.keys[:1], change=change)
-
 
 def _scenario(name: str, plant: Plant, params: Any, r: Any, episodes: int, **rest: Any) -> Scenario:
     """Parameters and reference repeated for each episode; episode i has noise seed i mod 32."""

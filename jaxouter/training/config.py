@@ -135,7 +135,14 @@ DEFAULT = TrainConfig(
 PRESETS: dict[str, dict[str, TrainConfig]] = {
     "pitch": {"default": DEFAULT, "paper": PAPER},
     "heaters": {
-        "default": replace(DEFAULT, plant="heaters", reward_scale=1.0, ddpg=replace(DEFAULT.ddpg, discount=0.95)),
+        "default": replace(
+            DEFAULT,
+            plant="heaters",
+            steps=68_000,
+            integral_steps=None,
+            reward_scale=1.0,
+            ddpg=replace(DEFAULT.ddpg, discount=0.95, saturation_penalty=1e-3),
+        ),
         "paper": replace(PAPER, plant="heaters", steps=400_000),
     },
 }

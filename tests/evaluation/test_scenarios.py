@@ -7,7 +7,6 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop.policy import none
-from jaxouter.plants import make
 
 PITCH = "paper delay-0.57 delay-5.7 delay-swapped uncertainty load noise steps staircase ramps sines doublets"
 HEATERS = "paper-4 paper-1000 riccati cold mixed-stock load noise steps staircase ramps days"
@@ -96,11 +95,3 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
 def test_unknown_scenario_lists_those_that_exist():
     with pytest.raises(ValueError, match="no scenario 'pitch/papers'; pitch has: pitch/paper, "):
         scenarios.get("pitch/papers")
-
-
-def test_first_keeps_one_episode():
-    scenario = scenarios.get("heaters/load").first()
-    whole = scenarios.get("heaters/load")
-    one = rollout(*none(scenario.plant), scenario)
-    np.testing.assert_allclose(one.y[0], rollout(*none(whole.plant), whole).y[0], rtol=1e-5)
-    assert make("heaters")[0] is scenario.plant

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+from functools import partial
 from typing import Any
 
 import chex
@@ -13,11 +14,13 @@ import numpy as np
 import pytest
 
 import jaxouter
+from jaxouter.loop import rewards, sensor
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Memory, Observer, Signals
 from jaxouter.plants import Plant
-from jaxouter.plants.heaters import HEATERS, HeatersParams, HeatersState
+from jaxouter.plants.heaters import HEATERS
 from jaxouter.plants.pitch import PITCH, PitchParams, PitchState
+from tests import lag
 
 KEY = jax.random.key(0)
 H = 3
@@ -197,82 +200,83 @@ class Scripted:
 
 
 def with_start(env: Environment, start: Any) -> Environment:
-    return dataclasses.replace(
-        env, plant=dataclasses.replace(env.plant, start=start), goal=Scripted(env.observer.y_middle)
-    )
+    plant = dataclasses.replace(env.plant, start=start)
+    return dataclasses.replace(env, plant=plant, goal=Scripted(env.observer.y_middle))
 
 
-def observations(env: Environment, params: EnvParams, key: jax.Array, steps: int = 25) -> tuple[jax.Array, EnvState]:
+@partial(jax.jit, static_argnums=0)
+def observations(env: Environment, params: EnvParams, key: jax.Array) -> tuple[jax.Array, EnvState]:
     """All that the agent sees along scripted actions, and the states."""
     low, high = env.plant.r_tilde_bounds
-    actions = (low + high) / 2 + (high - low) / 4 * jnp.cos(jnp.arange(steps, dtype=float))
+    actions = (low + high) / 2 + (high - low) / 4 * jnp.cos(jnp.arange(25, dtype=float))
+    first, state = env.reset(key, params)
 
-    @jax.jit
-    def run(key: jax.Array) -> tuple[jax.Array, EnvState]:
-        first, state = env.reset(key, params)
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, tuple[jax.Array, EnvState]]:
+        obs, state, *_ = env.step_env(key, state, action, params)
+        return state, (obs, state)
 
-        def step(state: EnvState, action: jax.Array) -> tuple[EnvState, tuple[jax.Array, EnvState]]:
-            obs, state, *_ = env.step_env(key, state, action, params)
-            return state, (obs, state)
-
-        _, (obs, states) = jax.lax.scan(step, state, actions)
-        return jnp.concatenate([first[None], obs]), states
-
-    return run(key)
+    _, (obs, states) = jax.lax.scan(step, state, actions)
+    return jnp.concatenate([first[None], obs]), states
 
 
-def test_hidden_state_and_parameters_of_pitch_do_not_reach_the_agent() -> None:
-    """An aircraft whose pitch angle cannot move, while everything that is hidden does."""
-    fixed = dict(
-        A=np.vstack([np.asarray(jaxouter.make("pitch")[1].plant.A)[:3], np.zeros(4)]), B=(0.01, -0.18, -1.16, 0)
-    )
+def hidden_start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
+    """A pitch angle of 2 crad; everything that is hidden is drawn."""
+    state = PITCH.init(key, params)
+    keys = PitchState(*jax.random.split(key, len(state)))
+    drawn = [jax.random.normal(k, leaf.shape, float) for k, leaf in zip(keys[:-1], state[:-1], strict=True)]
+    state = PitchState(*drawn, k=jax.random.randint(keys.k, (), 0, 100))
+    return state._replace(x=state.x.at[3].set(2.0))
 
-    def start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
-        state = PITCH.init(key, params)
-        leaves, tree = jax.tree.flatten(state._replace(k=state.xc))
-        hidden = [
-            jax.random.normal(jax.random.fold_in(key, i), leaf.shape, leaf.dtype) for i, leaf in enumerate(leaves)
-        ]
-        state = jax.tree.unflatten(tree, hidden)._replace(k=jax.random.randint(key, (), 0, 100))
-        return state._replace(x=state.x.at[3].set(2.0))
 
-    seen, states = [], []
-    for seed, overrides in enumerate(({}, dict(tau=0.3, d1=0.2, d2=0.1, gain=0.5, disturbance=1.0))):
-        K = dict(K1=[-0.02, 0.07, -0.8, -1.3], K2=-0.5)
-        env, params = jaxouter.make("pitch", max_delay=0.5, **fixed, **K, **overrides)
-        obs, state = observations(with_start(env, start), params, jax.random.key(seed))
-        seen.append(obs)
-        states.append(state.plant)
-    chex.assert_trees_all_equal(*seen)
-    for hidden in ("xc", "xi", "lines", "r_tilde_line", "k"):
-        assert bool((getattr(states[0], hidden) != getattr(states[1], hidden)).any()), hidden
-    assert bool((states[0].x[:, :3] != states[1].x[:, :3]).any())
-    assert float(jnp.ptp(seen[0], axis=0).max()) > 0.1
+@pytest.fixture(scope="module")
+def two_hidden_lives() -> list[tuple[jax.Array, EnvState]]:
+    """Of an aircraft whose pitch angle cannot move, while everything that is hidden does."""
+    A = np.array(jaxouter.make("pitch")[1].plant.A)
+    A[3] = 0.0
+    fixed = dict(A=A, K1=[-0.02, 0.07, -0.8, -1.3], K2=-0.5, max_delay=0.5)
+    lives = []
+    for seed, hidden in enumerate(({}, dict(tau=0.3, d1=0.2, d2=0.1, gain=0.5, disturbance=1.0))):
+        env, params = jaxouter.make("pitch", **fixed, **hidden)
+        lives.append(observations(with_start(env, hidden_start), params, jax.random.key(seed)))
+    return lives
+
+
+def test_hidden_state_and_parameters_do_not_reach_the_agent(two_hidden_lives: list[Any]) -> None:
+    (one, states), (other, other_states) = two_hidden_lives
+    chex.assert_trees_all_equal(one, other)
+    assert float(jnp.ptp(one, axis=0).max()) > 0.1
+    for name in ("xc", "xi", "lines", "r_tilde_line", "k"):
+        assert bool((getattr(states.plant, name) != getattr(other_states.plant, name)).any()), name
+    assert bool((states.plant.x[:, :3] != other_states.plant.x[:, :3]).all())
+
+
+def test_observation_is_that_of_the_present_signals_and_memory(two_hidden_lives: list[Any]) -> None:
+    obs, states = two_hidden_lives[0]
+    observer = Observer.of(PITCH)
+    seen = jax.vmap(observer.features)(states.memory, states.r, states.y_seen)
+    chex.assert_trees_all_close(seen, obs[1:], atol=1e-6)
 
 
 def test_single_houses_do_not_reach_the_agent() -> None:
-    """Houses spread about one and the same mean."""
-
-    def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
-        state = HEATERS.init(key, params)
-        return state._replace(k=jax.random.randint(key, (), 0, 1))
-
+    """Houses spread in two ways about one and the same mean."""
     env, params = jaxouter.make("heaters", sigma=0.0, x0_mean=18.0, x0_spread=5.0)
-    (one, houses), (other, other_houses) = (
-        observations(with_start(env, start), params, jax.random.key(seed)) for seed in (0, 1)
-    )
+    env = with_start(env, HEATERS.init)
+    (one, states), (other, other_states) = (observations(env, params, jax.random.key(seed)) for seed in (0, 1))
     chex.assert_trees_all_close(one, other, atol=1e-5)
-    assert float(jnp.abs(houses.plant.x - other_houses.plant.x).max()) > 1.0
+    assert float(jnp.abs(states.plant.x - other_states.plant.x).max()) > 1.0
 
 
-def test_elapsed_time_and_hidden_state_do_not_change_what_is_seen_of_a_moment() -> None:
-    env, params = jaxouter.make("pitch", max_delay=0.5)
-    obs, states = observations(env, params, KEY)
-    state = jax.tree.map(lambda leaf: leaf[-1], states)
-    shifted = state._replace(k=state.k + 77, plant=jax.tree.map(lambda leaf: leaf + jnp.ones_like(leaf), state.plant))
-    for moment in (state, shifted):
-        seen = env.observer.features(moment.memory, moment.r, moment.y_seen)
-        chex.assert_trees_all_close(seen, obs[-1], atol=1e-6)
+def test_elapsed_time_does_not_reach_the_agent() -> None:
+    env, params = lag_environment()
+    _, state = jax.jit(env.reset)(KEY, params)
     step = jax.jit(env.step_env)
-    same_plant = state._replace(k=state.k + 77)
-    chex.assert_trees_all_equal(step(KEY, state, scalar(5.0), params)[0], step(KEY, same_plant, scalar(5.0), params)[0])
+    early = step(KEY, state, scalar(1.0), params)
+    late = step(KEY, state._replace(k=state.k + 33), scalar(1.0), params)
+    chex.assert_trees_all_equal(early[0], late[0])
+    assert int(late[1].k) == 34
+
+
+def lag_environment() -> tuple[Environment, EnvParams]:
+    plant, plant_params = lag.make()
+    env = Environment(plant, Observer.of(plant), Scripted(0.0))
+    return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from functools import cache, partial
 
 import chex
 import jax
@@ -19,7 +19,7 @@ MIDDLE, HALF = 4.0, 16.0
 MEMBERS = 100
 
 
-@functools.cache
+@cache
 def members(kind: str, steps: int = STEPS) -> np.ndarray:
     """(MEMBERS, steps)."""
     draw = jax.jit(jax.vmap(lambda key: FAMILIES[kind](key, steps, LOW, HIGH)))
@@ -105,16 +105,15 @@ def test_days_are_sixteen_warm_and_eight_cool_hours() -> None:
     assert len(beginnings) > 12, "days begin at a random hour"
 
 
-def follow(goal: Goal, outputs: np.ndarray, key: jax.Array = KEY) -> np.ndarray:
+@partial(jax.jit, static_argnums=0)
+def _follow(goal: Goal, y: jax.Array) -> jax.Array:
+    state, r0 = goal.init(KEY, y[0])
+    return jnp.concatenate([r0[None], jax.lax.scan(goal.step, state, y[1:])[1]])
+
+
+def follow(goal: Goal, outputs: np.ndarray) -> np.ndarray:
     """r_0, r_1, ... when the plant gives these outputs, the first before the first step."""
-    y = jnp.asarray(outputs, float)
-
-    @jax.jit
-    def run(key: jax.Array) -> jax.Array:
-        state, r0 = goal.init(key, y[0])
-        return jnp.concatenate([r0[None], jax.lax.scan(goal.step, state, y[1:])[1]])
-
-    return np.asarray(run(key))
+    return np.asarray(_follow(goal, jnp.asarray(outputs, float)))
 
 
 def test_set_point_is_held_for_the_whole_episode() -> None:
