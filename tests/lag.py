@@ -68,7 +68,7 @@ def start(key: chex.PRNGKey, params: LagParams) -> LagState:
 
 def draw(key: chex.PRNGKey, params: LagParams) -> LagParams:
     """K uniform within 10 %."""
-    return params.replace(K=params.K * jax.random.uniform(key, (), float, 0.9, 1.1))
+    return dataclasses.replace(params, K=params.K * jax.random.uniform(key, (), float, 0.9, 1.1))
 
 
 def output(params: LagParams, state: LagState) -> jax.Array:

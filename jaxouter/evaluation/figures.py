@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
@@ -51,12 +52,9 @@ def _output(axes: Axes, scenario: Scenario, traces: Traces, color: str, label: s
     y = np.append(traces.y0[0], traces.y[0])
     axes.plot(t, y, color=color, lw=1.8, label=label)
     axes.set_ylabel(f"y [{unit}]")
-    # An unstable inner loop must not squeeze everything else into a line.
-    low, high = scenario.plant.evaluation_range
-    room = high - low
-    axes.set_ylim(max(y.min(), low - 1.2 * room) - 0.06 * room, min(y.max(), high + 1.2 * room) + 0.06 * room)
-    if y.min() > low - 1.2 * room and y.max() < high + 1.2 * room:
-        axes.autoscale(axis="y")
+    if not scenario.stable_alone:  # what runs away must not squeeze the rest into a line
+        low, high = scenario.plant.evaluation_range
+        axes.set_ylim(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low)
     axes.set_xlim(t[0], t[-1])
 
 
@@ -104,7 +102,6 @@ def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
             limit, color=LIMIT, ls=":", lw=1.2, label=f"comfort limit {limit:g} {unit}/{scenario.plant.time_unit}"
         )
     axes.set_ylabel(f"|Δy| [{unit}/{scenario.plant.time_unit}]")
-    axes.set_ylim(bottom=0)
     axes.set_xlim(0, t[-1])
 
 
@@ -120,7 +117,7 @@ def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> 
     """r, y and r~ over time with the bounds: the inner loop alone beside the learned outer loop."""
     rates = scenario.plant.rate_limit is not None
     figure = Figure(figsize=(10, 8.4 if rates else 6), layout="constrained")
-    grid = figure.subplots(3 if rates else 2, 2, sharex=True, squeeze=False)
+    grid = figure.subplots(3 if rates else 2, 2, sharex=True, sharey="row", squeeze=False)
     unit = _unit(scenario)
     for column, (name, traces) in enumerate((("inner loop alone", inner), ("learned outer loop", learned))):
         _houses(grid[0, column], scenario, traces)
@@ -131,6 +128,8 @@ def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> 
         if rates:
             _changes(grid[2, column], scenario, traces)
             _finish(grid[2, column], scenario)
+    if rates:
+        grid[2, 0].set_ylim(bottom=0)
     figure.suptitle(scenario.id, fontsize=11)
     return _save(figure, path)
 
@@ -158,6 +157,7 @@ def paper(
         title = f"({letter}) {scenario.id}, {name}: MAE {mae(traces):.3g} {_unit(scenario)}"
         if heaters and letter == "d":
             _changes(axes, scenario, traces)
+            axes.set_ylim(bottom=0)
             title = f"({letter}) {scenario.id}, {name}: change an hour"
         else:
             if name == "learned outer loop":
@@ -172,7 +172,6 @@ def paper(
                     lw=0.8,
                     label="modified reference r̃",
                 )
-                axes.autoscale(axis="y")
         _finish(axes, scenario, title)
     return _save(figure, path)
 
@@ -198,6 +197,9 @@ def learning_curve(
         left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
     left.set_ylabel("MAE without exploration")
     left.set_yscale("log")
+    left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    left.yaxis.set_major_formatter("{x:g}")
+    left.yaxis.set_minor_formatter(NullFormatter())
     left.set_title(title, fontsize=10, loc="left")
     right.set_ylabel("reward a step, with exploration")
     for axes in (left, right):

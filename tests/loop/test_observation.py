@@ -142,7 +142,7 @@ def test_shortest_window_gives_the_same_memory(recorded: Recorded) -> None:
         chex.assert_trees_all_close(memory_at(recorded.cut(i - H, i), H), recorded.memories[i], atol=1e-6)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 4])
+@pytest.mark.parametrize("steps", [1, 3])
 def test_observations_before_and_after_some_steps_are_those_seen(recorded: Recorded, steps: int) -> None:
     before_and_after = jax.jit(OBSERVER.before_and_after)
     compared = 0
@@ -233,7 +233,7 @@ def two_hidden_lives() -> list[tuple[jax.Array, EnvState]]:
     """Of an aircraft whose pitch angle cannot move, while everything that is hidden does."""
     A = np.array(jaxouter.make("pitch")[1].plant.A)
     A[3] = 0.0
-    fixed = dict(A=A, K1=[-0.02, 0.07, -0.8, -1.3], K2=-0.5, max_delay=0.5)
+    fixed: dict[str, Any] = dict(A=A, K1=[-0.02, 0.07, -0.8, -1.3], K2=-0.5, max_delay=0.5)
     lives = []
     for seed, hidden in enumerate(({}, dict(tau=0.3, d1=0.2, d2=0.1, gain=0.5, disturbance=1.0))):
         env, params = jaxouter.make("pitch", **fixed, **hidden)

@@ -123,7 +123,7 @@ def test_set_point_is_held_for_the_whole_episode() -> None:
 
 def test_set_points_of_different_keys_fill_the_range() -> None:
     goal = SetPoint(LOW, HIGH)
-    r = jax.jit(jax.vmap(lambda key: goal.init(key, jnp.zeros(()))[1]))(jax.random.split(KEY, 1000))
+    r = jax.jit(jax.vmap(goal.init, (0, None)))(jax.random.split(KEY, 1000), jnp.zeros(()))[1]
     assert LOW <= float(r.min()) < LOW + 0.5
     assert HIGH - 0.5 < float(r.max()) <= HIGH
     assert float(r.mean()) == pytest.approx(MIDDLE, abs=5 * HALF / np.sqrt(3 * 1000))
@@ -143,8 +143,8 @@ def test_set_point_is_redrawn_as_often_as_asked() -> None:
 
 
 def test_set_point_does_not_depend_on_the_output() -> None:
-    goal = SetPoint(LOW, HIGH, redraw=0.3)
-    np.testing.assert_array_equal(follow(goal, np.zeros(50)), follow(goal, np.linspace(-9.0, 9.0, 50)))
+    goal = SetPoint(LOW, HIGH, redraw=0.1)
+    np.testing.assert_array_equal(follow(goal, np.zeros(2001)), follow(goal, np.linspace(-9.0, 9.0, 2001)))
 
 
 def test_reaimed_changes_exactly_when_the_output_is_near() -> None:
@@ -166,7 +166,7 @@ def test_reaimed_tolerance_is_exclusive(distance: float, changes: bool) -> None:
     assert (float(r) != 1.0) == changes
 
 
-@pytest.mark.parametrize("kind", FAMILIES)
+@pytest.mark.parametrize("kind", ["ramps", "days"])
 def test_family_goal_plays_its_trajectory_and_holds_the_end(kind: str) -> None:
     r = follow(Family(kind, 60, LOW, HIGH), np.zeros(90))
     expected = np.asarray(jax.jit(lambda: FAMILIES[kind](KEY, 60, LOW, HIGH))())

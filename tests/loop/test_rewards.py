@@ -115,6 +115,8 @@ def test_constants_are_swept_under_vmap() -> None:
     p = rewards.params(PITCH)
     prices = jnp.array([0.3, 0.6, 0.9])
     zero = jnp.zeros(())
-    swept = jax.vmap(lambda price: rewards.reward(p.replace(alpha_g=price), zero + 2.0, zero, zero, zero, zero))(prices)
+    swept = jax.vmap(
+        lambda price: rewards.reward(dataclasses.replace(p, alpha_g=price), zero + 2.0, zero, zero, zero, zero)
+    )(prices)
     chex.assert_trees_all_close(swept, -2.0 * prices)
     chex.assert_type(swept, jnp.float32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ def test_parameters_are_traced() -> None:
     p = sensor.params()
     biases = jnp.array([0.0, 1.0, 2.0])
     y = jnp.asarray(3.0, float)
-    lanes = jax.vmap(lambda bias: sensor.measure(p.replace(bias=bias), KEY, y, y))(biases)
+    lanes = jax.vmap(lambda bias: sensor.measure(replace(p, bias=bias), KEY, y, y))(biases)
     np.testing.assert_allclose(lanes, [3.0, 4.0, 5.0])
     assert lanes.dtype == jnp.float32
 
