@@ -152,4 +152,4 @@ def show(policy: str, results: Results) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

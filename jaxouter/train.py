@@ -141,4 +141,4 @@ def show(met: list[scenarios.Scenario], simple: dict[str, Results], learned: dic
 
 
 if __name__ == "__main__":
-    main()
+    cli.run(main)

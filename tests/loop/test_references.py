@@ -166,7 +166,7 @@ def test_reaimed_tolerance_is_exclusive(distance: float, changes: bool) -> None:
     assert (float(r) != 1.0) == changes
 
 
-@pytest.mark.parametrize("kind", ["ramps", "days"])
+@pytest.mark.parametrize("kind", ["staircase", "days"])
 def test_family_goal_plays_its_trajectory_and_holds_the_end(kind: str) -> None:
     r = follow(Family(kind, 60, LOW, HIGH), np.zeros(90))
     expected = np.asarray(jax.jit(lambda: FAMILIES[kind](KEY, 60, LOW, HIGH))())

@@ -204,11 +204,11 @@ def test_converges_with_the_square_of_the_inner_step(tau: float, d1: float, d2: 
 
 
 def test_inner_step_precision_and_length_of_the_lines_matter_little_with_delays_off_the_grid() -> None:
-    delays = dict(tau=0.537, d1=0.123, d2=0.0049)
-    coarse, middle, fine = refined(**delays)
+    tau, d1, d2 = 0.537, 0.123, 0.0049
+    coarse, middle, fine = refined(tau, d1, d2)
     assert 0.0 < np.abs(coarse - fine).max() < 1e-5
     assert 0.0 < np.abs(middle - fine).max() < 1e-5
-    chex.assert_trees_all_close(run(16.0, **delays)[:100], coarse, atol=1e-4)
+    chex.assert_trees_all_close(run(16.0, tau=tau, d1=d1, d2=d2)[:100], coarse, atol=1e-4)
 
 
 def test_disturbance_adds_to_the_control() -> None:
@@ -260,6 +260,7 @@ def test_step_keeps_shapes_and_single_precision() -> None:
     chex.assert_type([*before[:-1], PITCH.output(params, before)], jnp.float32)
 
 
+@pytest.mark.slow
 def test_output_is_differentiable_in_the_modified_reference() -> None:
     params = nominal()
 
