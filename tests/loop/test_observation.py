@@ -235,7 +235,8 @@ def two_hidden_lives() -> list[tuple[jax.Array, EnvState]]:
     A[3] = 0.0
     fixed: dict[str, Any] = dict(A=A, K1=[-0.02, 0.07, -0.8, -1.3], K2=-0.5, max_delay=0.5)
     lives = []
-    for seed, hidden in enumerate(({}, dict(tau=0.3, d1=0.2, d2=0.1, gain=0.5, disturbance=1.0))):
+    others: tuple[dict[str, Any], ...] = ({}, dict(tau=0.3, d1=0.2, d2=0.1, gain=0.5, disturbance=1.0))
+    for seed, hidden in enumerate(others):
         env, params = jaxouter.make("pitch", **fixed, **hidden)
         lives.append(observations(with_start(env, hidden_start), params, jax.random.key(seed)))
     return lives

@@ -114,9 +114,11 @@ def test_divergence_is_configurable_and_costs_50_by_default() -> None:
 def test_constants_are_swept_under_vmap() -> None:
     p = rewards.params(PITCH)
     prices = jnp.array([0.3, 0.6, 0.9])
-    zero = jnp.zeros(())
-    swept = jax.vmap(
-        lambda price: rewards.reward(dataclasses.replace(p, alpha_g=price), zero + 2.0, zero, zero, zero, zero)
-    )(prices)
+    r, zero = jnp.asarray(2.0, float), jnp.zeros(())
+
+    def lane(price: jax.Array) -> jax.Array:
+        return rewards.reward(dataclasses.replace(p, alpha_g=price), r, zero, zero, zero, zero)
+
+    swept = jax.vmap(lane)(prices)
     chex.assert_trees_all_close(swept, -2.0 * prices)
     chex.assert_type(swept, jnp.float32)
