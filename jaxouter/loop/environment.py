@@ -98,7 +98,9 @@ class Environment:
         terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
         truncated = state.k + 1 >= plant.episode_steps
         y = jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y)
-        reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, state.memory.r_tilde_past[0])
+        # What the memory holds before the first step comes from the sensor; the reward is of the true y.
+        before = jnp.where(state.k == 0, jnp.clip(state.y, *plant.r_tilde_bounds), state.memory.r_tilde_past[0])
+        reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, before)
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
 
         y_seen = sensor.measure(params.sensor, key_sensor, y, state.y_seen)

@@ -94,8 +94,9 @@ def make(
     Raises:
         ValueError: a shape is wrong, n or substeps is not positive, or u_free does not fit.
     """
-    if n < 1 or substeps < 1:
-        raise ValueError(f"n is {n} and substeps is {substeps}; both must be at least 1")
+    for name, value in (("n", n), ("substeps", substeps)):
+        if int(value) != value or value < 1:
+            raise ValueError(f"{name} is {value}; it must be a whole number of at least 1")
     if u_free not in get_args(UFree):
         raise ValueError(f"u_free is {u_free!r}; it must be one of {', '.join(get_args(UFree))}")
     per_house = dict(
@@ -103,13 +104,19 @@ def make(
     )
     per_house |= dict(gain=gain, disturbance=disturbance)
     house = HouseParams(**{name: array(name, value, (), (n,)) for name, value in per_house.items()})
+    for name, lowest in (("Ca", 1e-6), ("r_u", 1e-6), ("sigma", 0.0)):
+        if float(jnp.min(getattr(house, name))) < lowest:
+            raise ValueError(f"{name} is {per_house[name]}; it must {'be positive' if lowest else 'not be negative'}")
     if u_free == "physical" and float(jnp.min(house.Pi)) < 17.0:
         raise ValueError(f"u_free 'physical' goes with Pi = 17.186 only; Pi is {Pi} (then no r~ >= 0 reaches 15 degC)")
+    shares = jnp.full(n, 1.0 / n) if weights is None else array("weights", weights, (n,))
+    if not float(jnp.sum(shares)) > 0.0:
+        raise ValueError(f"weights are {weights}; their sum must be positive")
     params = HeatersParams(
         house=house,
         x0_mean=array("x0_mean", x0_mean, (), (n,)),
         x0_spread=array("x0_spread", x0_spread, ()),
-        weights=jnp.full(n, 1.0 / n) if weights is None else array("weights", weights, (n,)),
+        weights=shares,
         u_free=u_free,
         substeps=substeps,
     )

@@ -96,7 +96,7 @@ def make(
     B_h: float = 1.0,
     C_h: float = 0.08,
     D_h: float = 0.1,
-    Q: Sequence[float] = (0.0, 0.0, 0.0, 1.0, 2.5),
+    Q: Any = (0.0, 0.0, 0.0, 1.0, 2.5),
     R: float = 10.0,
     K1: Any = None,
     K2: float | None = None,
@@ -120,26 +120,34 @@ def make(
     Raises:
         ValueError: a delay is negative or above max_delay, a shape is wrong, or there are too few substeps.
     """
-    longest = max(tau, d1, d2)
-    if max_delay is None:
-        max_delay = math.ceil(round(longest / CONTROL_STEP, 6)) * CONTROL_STEP
-    for name, value in (("tau", tau), ("d1", d1), ("d2", d2)):
-        if not 0.0 <= value <= max_delay:
-            raise ValueError(f"{name} is {value} s; a delay must lie in [0, max_delay] = [0, {max_delay:g}] s")
+    scalars = dict(tau=tau, d1=d1, d2=d2, A_h=A_h, B_h=B_h, C_h=C_h, D_h=D_h, gain=gain, disturbance=disturbance)
+    numbers = {name: array(name, value, ()) for name, value in scalars.items()}
+    A, B, Q = array("A", A, (4, 4)), array("B", B, (4,)), array("Q", Q, (5,))
+    delays = {name: float(numbers[name]) for name in ("tau", "d1", "d2")}
+    if max_delay is None and all(map(math.isfinite, delays.values())):
+        max_delay = max(0.0, math.ceil(round(max(delays.values()) / CONTROL_STEP, 5)) * CONTROL_STEP)
+    if max_delay is not None and not 0.0 <= max_delay < math.inf:
+        raise ValueError(f"max_delay is {max_delay:g} s; it must be a number of at least 0")
+    for name, value in delays.items():
+        if max_delay is None or not 0.0 <= value <= max_delay + 1e-6:
+            bound = "max_delay" if max_delay is None else f"{max_delay:g}"
+            raise ValueError(f"{name} is {value:g} s; a delay must lie in [0, max_delay] = [0, {bound}] s")
     if substeps < 10:
         raise ValueError(f"substeps is {substeps}; it must be at least 10 (an inner step of at most 0.01 s)")
     if K1 is None or K2 is None:
+        if not R > 0:
+            raise ValueError(f"R is {R}; it must be positive")
         designed = lqr(A, B, Q, R)
         K1 = designed[0] if K1 is None else K1
         K2 = designed[1] if K2 is None else K2
-    scalars = dict(tau=tau, d1=d1, d2=d2, A_h=A_h, B_h=B_h, C_h=C_h, D_h=D_h, K2=K2, gain=gain, disturbance=disturbance)
     params = PitchParams(
-        **{name: array(name, value, ()) for name, value in scalars.items()},
+        **numbers,
         W=array("W", W, (3,)),
-        A=array("A", A, (4, 4)),
-        B=array("B", B, (4,)),
+        A=A,
+        B=B,
         K1=array("K1", K1, (4,)),
-        max_delay=max_delay,
+        K2=array("K2", K2, ()),
+        max_delay=max_delay or 0.0,
         substeps=substeps,
     )
     return PITCH, params

@@ -277,6 +277,8 @@ def test_action_is_clipped_to_the_bounds(action: float, applied: float) -> None:
 
 def test_sensor_changes_what_is_seen_and_not_what_is_rewarded() -> None:
     env, params = make()
+    zero = scalar(0.0)
+    params = replace(params, reward=replace(params.reward, rho_h=zero, rho_b=zero))  # all moves are charged
     noisy = replace(params, sensor=sensor.params(noise=0.3, bias=1.0))
     actions = jnp.linspace(-2.0, 2.0, 20)
     (_, clean_start), (clean_obs, clean, clean_reward, *_) = episode(env, params, actions)
