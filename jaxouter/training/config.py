@@ -127,9 +127,9 @@ DEFAULT = TrainConfig(
         rate_decay="cosine",
         critic_l2=0.0,
         batch_size=256,
-        discount=0.98,
+        discount=0.99,
         polyak=0.005,
-        saturation_penalty=3e-3,
+        saturation_penalty=1e-3,
     ),
 )
 PRESETS: dict[str, dict[str, TrainConfig]] = {
@@ -141,7 +141,7 @@ PRESETS: dict[str, dict[str, TrainConfig]] = {
             steps=68_000,
             integral_steps=None,
             reward_scale=1.0,
-            ddpg=replace(DEFAULT.ddpg, discount=0.95, saturation_penalty=1e-3),
+            ddpg=replace(DEFAULT.ddpg, discount=0.95),
         ),
         "paper": replace(PAPER, plant="heaters", steps=400_000),
     },
