@@ -150,8 +150,10 @@ def test_update_is_the_same_with_and_without_jit():
 
 
 def learn(batch: Batch, updates: int):
-    cfg = DDPGConfig(hidden=(32, 32), actor_rate=3e-3, critic_rate=3e-3, critic_l2=0.0, polyak=0.05)
-    learner = DDPG(cfg, batch.obs.shape[1])
+    cfg = DDPGConfig(
+        hidden=(32, 32), actor_rate=3e-3, critic_rate=3e-3, rate_decay="cosine", critic_l2=0.0, polyak=0.05
+    )
+    learner = DDPG(cfg, batch.obs.shape[1], total_updates=updates)
 
     def step(state, key):
         return learner.update(state, batch, key)[0], None
@@ -199,7 +201,7 @@ def test_probe_endless_reward_is_a_geometric_series():
 def test_probe_best_action_depends_on_the_observation():
     obs = np.repeat([-1.0, 1.0], 32)
     actions = np.tile(np.linspace(-1, 1, 32), 2)
-    learner, state = learn(probe(obs, actions, -((actions - 0.5 * obs) ** 2), np.zeros(64), obs), 6000)
+    learner, state = learn(probe(obs, actions, -np.abs(actions - 0.5 * obs), np.zeros(64), obs), 6000)
     best = learner.act(state.actor, jnp.array([[-1.0], [1.0]]))[:, 0]
     np.testing.assert_allclose(best, [-0.5, 0.5], atol=0.08)
 
