@@ -96,7 +96,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "seconds": time.perf_counter() - begun,
+        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)),
         "steps": run.config.steps,
         "updates": run.config.total_updates,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
@@ -104,7 +104,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned)
-    print(f"{summary['seconds']:.0f} s in all; run folder {run.path}, main figure {main_figure}")
+    print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 
 def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results) -> Path:
