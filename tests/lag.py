@@ -93,12 +93,26 @@ def _relax(p: LagParams, y: jax.Array, held: jax.Array, share: jax.Array) -> jax
     return p.K * held + (y - p.K * held) * jnp.exp(-share * CONTROL_STEP / p.T)
 
 
+def variables(params: LagParams, state: LagState) -> LagState:
+    """The state without clock, its line from the oldest to the newest sample."""
+    del params
+    return state._replace(line=jnp.roll(state.line, -state.k), k=None)
+
+
+def settled(params: LagParams, state: LagState, variables: LagState) -> LagState:
+    """These variables at a clock at which the next sample belongs in row 0, late enough to fill the line."""
+    del params
+    return variables._replace(k=jnp.full_like(state.k, state.line.shape[0]))
+
+
 LAG = Plant(
     name="lag",
     init=init,
     step=step,
     output=output,
     start=start,
+    variables=variables,
+    settled=settled,
     y_unit="1",
     time_unit="s",
     control_step=CONTROL_STEP,

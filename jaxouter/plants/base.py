@@ -11,6 +11,24 @@ import jax
 import jax.numpy as jnp
 
 
+def float_leaves(params: Any, state: Any) -> list[jax.Array]:
+    """The default of `Plant.variables`: every float leaf of the state."""
+    del params
+    return [leaf for leaf in jax.tree.leaves(state) if _is_float(leaf)]
+
+
+def with_float_leaves(params: Any, state: Any, variables: list[jax.Array]) -> Any:
+    """The default of `Plant.settled`: the state with these float leaves, the rest as in `state`."""
+    del params
+    leaves, structure = jax.tree.flatten(state)
+    given = iter(variables)
+    return jax.tree.unflatten(structure, [next(given) if _is_float(leaf) else leaf for leaf in leaves])
+
+
+def _is_float(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
 @dataclass(frozen=True)
 class Plant:
     """A plant with its inner loop, seen from outside: r~ goes in, y comes out.
@@ -60,6 +78,15 @@ class Plant:
     members: Callable[[Any, Any], jax.Array] | None = None
     """`members(params, state) -> (n,)`: the single outputs of which y is a weighted mean; None: y is all there is."""
 
+    variables: Callable[[Any, Any], Any] = float_leaves
+    """`variables(params, state) -> pytree of floats`: what evolves, in time-invariant form, so delay lines from the
+    oldest to the newest sample, and without clocks, keys and constants of the episode."""
+    settled: Callable[[Any, Any, Any], Any] = with_float_leaves
+    """`settled(params, state, variables) -> state`, the inverse of `variables`: the state long after the start (t to
+    infinity) with these variables and the constants of `state`. Its step must not depend on clocks any more."""
+    noise_free: Callable[[Any], Any] = lambda params: params
+    """`noise_free(params) -> params`: the same plant without noise."""
+
     def __post_init__(self) -> None:
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):
             low, high = getattr(self, field)
@@ -67,6 +94,8 @@ class Plant:
                 raise ValueError(f"plant {self.name!r}: {field} is {(low, high)}; the first must be below the second")
         if self.control_step <= 0 or self.episode_steps < 1:
             raise ValueError(f"plant {self.name!r}: control_step and episode_steps must be positive")
+        if (self.variables is float_leaves) != (self.settled is with_float_leaves):
+            raise ValueError(f"plant {self.name!r}: variables and settled are inverse; declare both or neither")
 
     def training_start(self, key: chex.PRNGKey, params: Any) -> Any:
         """State at the start of a training episode."""

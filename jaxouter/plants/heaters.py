@@ -6,6 +6,7 @@ house may be one number for all or an array (n,).
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Literal, NamedTuple, get_args
 
 import chex
@@ -185,6 +186,24 @@ def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: ch
     return HeatersState(x, state.x0, state.k + 1)
 
 
+def variables(params: HeatersParams, state: HeatersState) -> HeatersState:
+    """The temperatures; where the houses started stays as it is."""
+    del params
+    return state._replace(x0=None, k=None)
+
+
+def settled(params: HeatersParams, state: HeatersState, variables: HeatersState) -> HeatersState:
+    """These temperatures when exp(lambda1 t) has died out."""
+    del params
+    return state._replace(x=variables.x, k=jnp.full_like(state.k, 2**30))
+
+
+def noise_free(params: HeatersParams) -> HeatersParams:
+    """The same houses with sigma 0."""
+    house = dataclasses.replace(params.house, sigma=jnp.zeros_like(params.house.sigma))
+    return dataclasses.replace(params, house=house)
+
+
 HEATERS = Plant(
     name="heaters",
     init=init,
@@ -192,6 +211,9 @@ HEATERS = Plant(
     output=output,
     start=start,
     members=members,
+    variables=variables,
+    settled=settled,
+    noise_free=noise_free,
     y_unit="degC",
     time_unit="h",
     control_step=CONTROL_STEP,

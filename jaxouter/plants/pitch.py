@@ -212,6 +212,22 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
     return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.k + 1)
 
 
+def variables(params: PitchParams, state: PitchState) -> PitchState:
+    """The state without clock, its lines from the oldest to the newest sample."""
+    return state._replace(
+        lines=jnp.roll(state.lines, -state.k * params.substeps, axis=1),
+        r_tilde_line=jnp.roll(state.r_tilde_line, -state.k),
+        k=None,
+    )
+
+
+def settled(params: PitchParams, state: PitchState, variables: PitchState) -> PitchState:
+    """These variables at a clock at which the next sample of every line belongs in row 0, late enough to fill them."""
+    del params
+    k = state.lines.shape[1] * state.r_tilde_line.shape[0]
+    return variables._replace(k=jnp.full_like(state.k, k))
+
+
 def _discretise(p: PitchParams, h: float) -> jax.Array:
     """(6, 8): [x; xc; xi] after an inner step of h, from [x; xc; xi; delayed theta_e; u + W1] at its start.
 
@@ -238,6 +254,8 @@ PITCH = Plant(
     step=step,
     output=output,
     start=start,
+    variables=variables,
+    settled=settled,
     y_unit="crad",
     time_unit="s",
     control_step=CONTROL_STEP,
