@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import chex
@@ -51,8 +52,17 @@ class _Inputs(NamedTuple):
 
 def _axes(inputs: _Inputs) -> Any:
     """Which leaves have an axis of episodes, for vmap."""
-    axes: Any = (0, None if inputs.change is None else (None, 0), None, None)
+    each = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, inputs.sensor)
+    axes: Any = (0, None if inputs.change is None else (None, 0), each, None)
     return _Inputs(*axes)
+
+
+def parameters(params: Any, change: tuple[jax.Array, Any] | None, k: jax.Array) -> Any:
+    """The plant's parameters at step k, when from step `change[0]` on they are `change[1]`."""
+    if change is None:
+        return params
+    at, after = change
+    return jax.tree.map(lambda a, b: jnp.where(k >= at, a, b), after, params)
 
 
 def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike) -> jax.Array:
@@ -78,13 +88,11 @@ def _advance(
 ) -> tuple[_Run, dict[str, jax.Array]]:
     """One control step of the plant, r~ clipped to its bounds."""
     key_plant, key_sensor = jax.random.split(key)
-    params = inputs.params
-    if inputs.change is not None:
-        at, after = inputs.change
-        params = jax.tree.map(lambda a, b: jnp.where(k >= at, a, b), after, params)
+    params = parameters(inputs.params, inputs.change, k)
     r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
     state = plant.step(params, run.plant, r_tilde, key_plant)
-    y = plant.output(params, state)
+    # A policy that failed has diverged at once, even where a dead time would hide it until the episode is over.
+    y = jnp.where(jnp.isnan(r_tilde), jnp.nan, plant.output(params, state))
     out = dict(y=y, r_tilde=r_tilde, reward=rewards.reward(inputs.reward, r, y, run.y, r_tilde, run.r_tilde))
     if plant.members is not None:
         members = plant.members(params, state)
@@ -95,9 +103,20 @@ def _advance(
     return _Run(state, y, y_seen, r_tilde), out
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inputs: _Inputs, r: Any, keys: Any) -> Any:
-    def episode(inputs: _Inputs, r: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, dict[str, jax.Array]]:
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _rollout(
+    plant: Plant,
+    policy: Policy,
+    record: bool,
+    per_episode: bool,
+    policy_params: Any,
+    inputs: _Inputs,
+    r: Any,
+    keys: Any,
+) -> Any:
+    def episode(
+        policy_params: Any, inputs: _Inputs, r: jax.Array, key: chex.PRNGKey
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         key_begin, key_policy, key_run = jax.random.split(key, 3)
         run = _begin(plant, inputs, key_begin)
 
@@ -113,17 +132,25 @@ def _rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inp
         memory = policy.init(policy_params, r[0], run.y_seen)
         return run.y, jax.lax.scan(step, (run, memory), xs)[1]
 
-    return jax.vmap(episode, (_axes(inputs), 0, 0))(inputs, r, keys)
+    return jax.vmap(episode, (0 if per_episode else None, _axes(inputs), 0, 0))(policy_params, inputs, r, keys)
 
 
-def rollout(policy: Policy, policy_params: Any, scenario: Scenario, record_members: bool = False) -> Traces:
+def rollout(
+    policy: Policy,
+    policy_params: Any,
+    scenario: Scenario,
+    record_members: bool = False,
+    per_episode: bool = False,
+) -> Traces:
     """Run a policy on every episode of a scenario, without an early end.
 
     Args:
-        policy: JAX policies run jitted and vmapped; those with `host` True are called step by step with NumPy scalars.
+        policy: JAX policies run jitted and vmapped; those with `host` True are called step by step with NumPy scalars
+            and without key. An episode in which r~ is nan has diverged: its y is nan.
         policy_params: its parameters.
         scenario: the episodes.
         record_members: keep the single outputs (the temperature of each house) too.
+        per_episode: each leaf of `policy_params` has a leading axis of episodes; otherwise all episodes share them.
 
     Returns:
         Traces as NumPy arrays.
@@ -132,7 +159,7 @@ def rollout(policy: Policy, policy_params: Any, scenario: Scenario, record_membe
     change = None if scenario.change is None else (jnp.asarray(scenario.change[0]), scenario.change[1])
     inputs = _Inputs(scenario.params, change, scenario.sensor, rewards.params(plant))
     run = _host_rollout if policy.host else _rollout
-    y0, out = run(plant, policy, record_members, policy_params, inputs, scenario.r, scenario.keys)
+    y0, out = run(plant, policy, record_members, per_episode, policy_params, inputs, scenario.r, scenario.keys)
     out = {name: np.asarray(value) for name, value in out.items()}
     nothing = np.full(out["y"].shape, np.nan)
     return Traces(
@@ -157,25 +184,45 @@ def _advance_all(
     plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: Any, r: Any, r_tilde: Any, keys: Any
 ) -> Any:
     step = partial(_advance, plant, record)
-    return jax.vmap(step, (_axes(inputs), 0, None, 0, 0, 0))(inputs, run, k, r, r_tilde, keys)
+    return jax.vmap(step, (_axes(inputs), 0, None, 0, 0, 0))(inputs, run, k, r[:, k], r_tilde, keys[:, k])
 
 
-def _host_rollout(plant: Plant, policy: Policy, record: bool, policy_params: Any, inputs: _Inputs, r: Any, keys: Any):
-    """The same episodes with a policy in plain Python; the keys are those of `_rollout`."""
-    steps = r.shape[1]
-    key_begin, key_policy, key_run = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-    run_keys, act_keys = (jax.vmap(lambda key: jax.random.split(key, steps))(key) for key in (key_run, key_policy))
+def _act(policy: Policy, params: Any, memory: Any, r: Any, y: Any) -> tuple[Any, float]:
+    """One act on the host; r~ is nan once y is not finite, or where the policy's arithmetic fails."""
+    if not np.isfinite(y):
+        return memory, np.nan
+    try:
+        memory, r_tilde = policy.act(params, memory, r, y)
+    except (ArithmeticError, np.linalg.LinAlgError):
+        return memory, np.nan
+    return memory, float(r_tilde)
+
+
+def _host_rollout(
+    plant: Plant,
+    policy: Policy,
+    record: bool,
+    per_episode: bool,
+    policy_params: Any,
+    inputs: _Inputs,
+    r: Any,
+    keys: Any,
+) -> Any:
+    """The same episodes with a policy in plain Python; start, plant and sensor have the keys of `_rollout`."""
+    episodes, steps = r.shape
+    key_begin, _, key_run = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
+    run_keys = jax.vmap(lambda key: jax.random.split(key, steps))(key_run)
+    params = [policy_params] * episodes
+    if per_episode:
+        params = [jax.tree.map(itemgetter(i), policy_params) for i in range(episodes)]
     run = _begin_all(plant, inputs, key_begin)
-    y0, outs = run.y, []
-    memories = [policy.init(policy_params, r_0, y) for r_0, y in zip(np.asarray(r[:, 0]), np.asarray(y0), strict=True)]
+    y0, y_seen, r_host, outs = np.asarray(run.y), np.asarray(run.y_seen), np.asarray(r), []
+    memories = [policy.init(*first) for first in zip(params, r_host[:, 0], y_seen, strict=True)]
     for k in range(steps):
-        y_seen = np.asarray(run.y_seen)
-        acts = [
-            policy.act(policy_params, memory, r_k, y, key)
-            for memory, r_k, y, key in zip(memories, np.asarray(r[:, k]), y_seen, act_keys[:, k], strict=True)
-        ]
+        acts = [_act(policy, *seen) for seen in zip(params, memories, r_host[:, k], y_seen, strict=True)]
         memories = [memory for memory, _ in acts]
-        r_tilde = jnp.asarray([float(value) for _, value in acts])
-        run, out = _advance_all(plant, record, inputs, run, jnp.asarray(k), r[:, k], r_tilde, run_keys[:, k])
+        r_tilde = np.array([value for _, value in acts], y0.dtype)
+        run, out = _advance_all(plant, record, inputs, run, k, r, r_tilde, run_keys)
+        y_seen, out = jax.device_get((run.y_seen, out))
         outs.append(out)
-    return y0, jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *outs)
+    return y0, {name: np.stack([out[name] for out in outs], 1) for name in outs[0]}

@@ -36,7 +36,7 @@ class Scenario:
     segments: bool = True  # r is made of held set-points
     stable_alone: bool = True  # the inner loop alone is stable
     change: tuple[int, Any] | None = None  # from this control step on, these parameters
-    sensor: SensorParams = field(default_factory=sensors.params)
+    sensor: SensorParams = field(default_factory=sensors.params)  # each leaf a number for all, or (episodes,)
     paper: tuple[float, float] | None = None  # MAE in the paper: inner loop alone, its DRL
 
 

@@ -16,6 +16,9 @@ class Policy(Protocol):
     """An outer loop: sees r and y, chooses r~. Pure and jit-able, unless `host` is True: then plain NumPy or Python.
 
     A JAX policy must be hashable (a frozen dataclass); what is learned or tuned goes into `params`, a pytree.
+
+    A host policy gets NumPy scalars and no key: one that draws keeps a generator of its own in the carry. Where it
+    cannot decide it returns nan, or raises ArithmeticError or LinAlgError: that episode then counts as diverged.
     """
 
     @property

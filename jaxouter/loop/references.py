@@ -27,6 +27,14 @@ def constant(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Arra
     return jnp.full(steps, jax.random.uniform(key, (), float, low, high))
 
 
+def telegraph(key: chex.PRNGKey, steps: int, low: float, high: float, redraw: jax.Array | float) -> jax.Array:
+    """A level uniform in [low, high], redrawn at each step with probability `redraw`; (steps,)."""
+    key_when, key_level = jax.random.split(key)
+    when = jax.random.uniform(key_when, (steps,), float) < redraw
+    levels = jax.random.uniform(key_level, (steps,), float, low, high)
+    return levels[jax.lax.cummax(jnp.where(when, jnp.arange(steps), 0))]
+
+
 def staircase(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
     """Five set-points, each held equally long."""
     levels = jax.random.uniform(key, (SEGMENTS,), float, low, high)

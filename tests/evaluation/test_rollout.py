@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.metrics import figures_of_merit
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.loop import sensor
 from jaxouter.loop.policy import none
 
 
@@ -37,6 +39,39 @@ class Random:
         return carry, jax.random.normal(key)
 
 
+@dataclass(frozen=True)
+class HostRandom:
+    """r~ normal from a generator of its own; its params are the seed."""
+
+    host: bool = True
+
+    def init(self, params, r0, y0):
+        return np.random.default_rng(params)
+
+    def act(self, params, carry, r, y, key=None):
+        assert key is None
+        return carry, carry.normal()
+
+
+@dataclass(frozen=True)
+class Failing:
+    """r~ = r until step `params`, where it fails; it must not be asked again."""
+
+    error: type[Exception] | None
+    host: bool = True
+
+    def init(self, params, r0, y0):
+        return 0
+
+    def act(self, params, carry, r, y, key=None):
+        assert carry <= params
+        if carry == params:
+            if self.error is not None:
+                raise self.error("cannot")
+            return carry + 1, np.nan
+        return carry + 1, r
+
+
 @pytest.mark.parametrize("identifier", ["pitch/noise", "heaters/load"])
 def test_host_policy_meets_the_same_episodes(identifier):
     scenario = scenarios.get(identifier, 2)
@@ -45,11 +80,51 @@ def test_host_policy_meets_the_same_episodes(identifier):
         np.testing.assert_allclose(getattr(host, name), getattr(jitted, name), rtol=1e-4, atol=1e-3)
 
 
-def test_random_policy_gets_another_key_at_each_step_and_the_same_on_the_host():
+def test_random_policy_gets_another_key_at_each_step():
+    traces = rollout(Random(), None, scenarios.get("pitch/paper", 2))
+    assert len(np.unique(traces.r_tilde)) == traces.r_tilde.size
+
+
+@pytest.mark.parametrize("host", [False, True])
+def test_parameters_may_differ_from_episode_to_episode(host):
+    scenario = scenarios.get("pitch/noise", 3)
+    gains = np.array([0.0, 0.01, 0.02], np.float32)
+    traces = rollout(Integrator(host), gains, scenario, per_episode=True)
+    for i, gain in enumerate(gains):
+        alone = rollout(Integrator(), gain, scenario)
+        np.testing.assert_allclose(traces.y[i], alone.y[i], rtol=1e-4, atol=1e-3)
+
+
+def test_host_policy_draws_from_its_own_generator():
     scenario = scenarios.get("pitch/paper", 2)
-    jitted, host = (rollout(Random(host), None, scenario) for host in (False, True))
-    assert len(np.unique(jitted.r_tilde)) == jitted.r_tilde.size
-    np.testing.assert_allclose(host.r_tilde, jitted.r_tilde, rtol=1e-6)
+    traces = rollout(HostRandom(), np.array([1, 2]), scenario, per_episode=True)
+    expected = [np.random.default_rng(seed).normal(size=200) for seed in (1, 2)]
+    np.testing.assert_allclose(traces.r_tilde, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("error", [None, ZeroDivisionError, np.linalg.LinAlgError])
+@pytest.mark.parametrize("step", [5, 199])
+def test_host_policy_that_fails_has_diverged(error, step):
+    scenario = scenarios.get("pitch/paper", 2)
+    traces = rollout(Failing(error), np.array([step, 1000]), scenario, per_episode=True)
+    assert np.isfinite(traces.y[0, :step]).all()
+    assert np.isnan(traces.y[0, step:]).all()
+    assert np.isfinite(traces.y[1]).all()
+    assert figures_of_merit(traces, scenario)["diverged"]
+
+
+def test_mistake_of_a_host_policy_is_not_hidden():
+    with pytest.raises(KeyError, match="cannot"):
+        rollout(Failing(KeyError), 3, scenarios.get("pitch/paper"))
+
+
+def test_sensor_may_differ_from_episode_to_episode():
+    scenario = scenarios.get("pitch/noise", 2)
+    mixed = replace(scenario, sensor=scenario.sensor.replace(noise=jnp.array([0.0, 0.2])))
+    clean = replace(scenario, sensor=sensor.params())
+    a, noisy, calm = (rollout(Integrator(), np.float32(0.02), s).y for s in (mixed, scenario, clean))
+    np.testing.assert_allclose(a, [calm[0], noisy[1]], rtol=1e-5, atol=1e-5)
+    assert np.abs(calm[1] - noisy[1]).max() > 1e-3
 
 
 def test_r_tilde_is_held_to_its_bounds_whatever_the_policy_says():
