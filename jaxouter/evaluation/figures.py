@@ -22,7 +22,8 @@ INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#
 UNITS = {"degC": "°C"}
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
+    """Write the PNG, in the style of all figures."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
@@ -31,17 +32,19 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _unit(scenario: Scenario) -> str:
-    return UNITS.get(scenario.plant.y_unit, scenario.plant.y_unit)
+def symbol(unit: str) -> str:
+    """A unit as it is written in a figure."""
+    return UNITS.get(unit, unit)
 
 
-def _times(scenario: Scenario, steps: int) -> np.ndarray:
+def times(scenario: Scenario, steps: int) -> np.ndarray:
+    """Times of the samples 0..steps, in the plant's unit."""
     return scenario.plant.control_step * np.arange(steps + 1)
 
 
 def _output(axes: Axes, scenario: Scenario, traces: Traces, color: str, label: str) -> None:
     """Y of the first episode, r, and the limits on y."""
-    t, unit = _times(scenario, traces.r.shape[1]), _unit(scenario)
+    t, unit = times(scenario, traces.r.shape[1]), symbol(scenario.plant.y_unit)
     limit = scenario.plant.output_limit
     if limit is not None:
         for i, bound in enumerate((-limit, limit)):
@@ -60,7 +63,7 @@ def _output(axes: Axes, scenario: Scenario, traces: Traces, color: str, label: s
 
 def _modified(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """r~ of the first episode and its bounds."""
-    t, unit = _times(scenario, traces.r.shape[1]), _unit(scenario)
+    t, unit = times(scenario, traces.r.shape[1]), symbol(scenario.plant.y_unit)
     low, high = scenario.plant.r_tilde_bounds
     for i, bound in enumerate((low, high)):
         axes.axhline(bound, color=LIMIT, ls=":", lw=1.2, label=f"bounds of r̃ [{low:g}, {high:g}] {unit}" if i else None)
@@ -80,7 +83,7 @@ def _houses(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """The spread of the single outputs of the first episode."""
     if traces.members is None:
         return
-    t = _times(scenario, traces.r.shape[1])[1:]
+    t = times(scenario, traces.r.shape[1])[1:]
     quantiles = np.quantile(traces.members[0], [0.0, 0.05, 0.95, 1.0], axis=1)
     axes.fill_between(t, quantiles[0], quantiles[3], color=LEARNED, alpha=0.12, lw=0, label="all houses")
     axes.fill_between(t, quantiles[1], quantiles[2], color=LEARNED, alpha=0.25, lw=0, label="90 % of the houses")
@@ -88,7 +91,7 @@ def _houses(axes: Axes, scenario: Scenario, traces: Traces) -> None:
 
 def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """|change| a control step of y and of the single outputs, against the rate limit."""
-    t, unit = _times(scenario, traces.r.shape[1])[1:], _unit(scenario)
+    t, unit = times(scenario, traces.r.shape[1])[1:], symbol(scenario.plant.y_unit)
     if traces.members is not None:
         change = np.abs(np.diff(traces.members[0], axis=0))
         axes.fill_between(t[1:], 0, change.max(1), color=LEARNED, alpha=0.12, lw=0, label="largest of all houses")
@@ -118,7 +121,7 @@ def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> 
     rates = scenario.plant.rate_limit is not None
     figure = Figure(figsize=(10, 8.4 if rates else 6), layout="constrained")
     grid = figure.subplots(3 if rates else 2, 2, sharex=True, sharey="row", squeeze=False)
-    unit = _unit(scenario)
+    unit = symbol(scenario.plant.y_unit)
     for column, (name, traces) in enumerate((("inner loop alone", inner), ("learned outer loop", learned))):
         _houses(grid[0, column], scenario, traces)
         _output(grid[0, column], scenario, traces, INNER if column == 0 else LEARNED, "output y")
@@ -131,7 +134,7 @@ def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> 
     if rates:
         grid[2, 0].set_ylim(bottom=0)
     figure.suptitle(scenario.id, fontsize=11)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def paper(
@@ -154,7 +157,7 @@ def paper(
     figure = Figure(figsize=(10, 3.4 * len(panels) / 2), layout="constrained")
     grid = np.ravel(figure.subplots(len(panels) // 2, 2))
     for axes, letter, (scenario, name, traces) in zip(grid, "abcd", panels, strict=False):
-        title = f"({letter}) {scenario.id}, {name}: MAE {mae(traces):.3g} {_unit(scenario)}"
+        title = f"({letter}) {scenario.id}, {name}: MAE {mae(traces):.3g} {symbol(scenario.plant.y_unit)}"
         if heaters and letter == "d":
             _changes(axes, scenario, traces)
             axes.set_ylim(bottom=0)
@@ -165,7 +168,7 @@ def paper(
             _output(axes, scenario, traces, INNER if name == "inner loop alone" else LEARNED, "output y")
             if name == "learned outer loop":
                 axes.step(
-                    _times(scenario, traces.r.shape[1])[:-1],
+                    times(scenario, traces.r.shape[1])[:-1],
                     traces.r_tilde[0],
                     where="post",
                     color=MODIFIED,
@@ -173,7 +176,7 @@ def paper(
                     label="modified reference r̃",
                 )
         _finish(axes, scenario, title)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def learning_curve(
@@ -205,4 +208,4 @@ def learning_curve(
     for axes in (left, right):
         axes.set_xlabel("environment steps [thousand]")
         axes.legend(fontsize=7.5, framealpha=0.85)
-    return _save(figure, path)
+    return save(figure, path)

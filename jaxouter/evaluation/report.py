@@ -1,0 +1,317 @@
+"""The report of a comparison: one HTML page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+
+from jaxouter.evaluation.figures import symbol
+from jaxouter.evaluation.statistics import Line, lines
+
+KIND_NAMES = {
+    "learned": "learned",
+    "user": "user's",
+    "rival": "rival",
+    "limit": "limit, not ranked",
+    "preview": "with preview, not ranked",
+}
+SCALE = 0.75  # of the pixels of a picture
+SCRIPT = """
+const select = document.getElementById("scenario"), image = document.getElementById("response");
+const show = () => {
+  const { uri, width, height } = select.selectedOptions[0].dataset;
+  for (const table of document.querySelectorAll(".merits")) table.hidden = table.dataset.scenario !== select.value;
+  if (!image) return;
+  const figure = image.closest("figure"), name = select.selectedOptions[0].text;
+  figure.hidden = !uri;
+  if (!uri) return;
+  image.src = uri; image.width = width; image.height = height;
+  image.style.setProperty("--width", width + "px");
+  const caption = `y of every policy with r and the limits, and r\\u0303 below: ${name}, first episode.`;
+  image.alt = figure.querySelector("figcaption").textContent = caption;
+};
+select.addEventListener("change", show);
+show();
+"""
+TERMS = (
+    ("limit", "a policy with the same network and observation, trained by back-propagation through the simulator"),
+    ("with preview", "the least error of any r̃ within the bounds, knowing plant, state, noise and the whole reference"),
+    ("outside the limits", "the limit of y, or of its change, is left in more than 0.1 % of the steps"),
+    ("rank", "by MAE, among the learned, the users' and the rival policies that keep the limits and do not diverge"),
+)
+
+
+class Merit(NamedTuple):
+    """A figure of merit as the page shows it."""
+
+    key: str
+    title: str
+    unit: str
+    meaning: str
+
+
+class Image(NamedTuple):
+    """A picture as the page holds it, and the size at which it is shown: letters as large as the text beside it."""
+
+    uri: str
+    width: int
+    height: int
+
+
+class Cell(NamedTuple):
+    """One field of the table of errors."""
+
+    mae: float | None
+    ratio: float | None
+    out: bool
+    mark: str  # class: best, out, diverged, or none
+    why: str
+
+
+class TableLine(NamedTuple):
+    """One line of the table of errors."""
+
+    label: str
+    kind: str
+    remark: str
+    cells: list[Cell]
+    mean_rank: float | None
+
+
+def merits(y_unit: str, time_unit: str) -> list[Merit]:
+    """The figures of merit in the order in which the page shows and defines them."""
+    y, t = symbol(y_unit), time_unit
+    return [
+        Merit("mae", "MAE", y, "mean of e over steps and episodes"),
+        Merit("ratio_to_limit", "ratio to the limit", "", "MAE over that of the limit"),
+        Merit("ratio_to_bound", "ratio to the bound", "", "MAE over that of the policy with preview, a lower bound"),
+        Merit("improvement", "improvement", "%", "of the MAE over the inner loop alone; not where that is unstable"),
+        Merit("iae", "IAE", f"{y} {t}", "integral of e over an episode"),
+        Merit("ise", "ISE", f"{y}² {t}", "integral of e²"),
+        Merit("itae", "ITAE", f"{y} {t}²", "integral of t e over a set-point, t from its start"),
+        Merit("overshoot", "overshoot", "%", "beyond the set-point, of the step; median over set-points"),
+        Merit("settling_time", "settling time", t, "until e stays within 5 % of the step; median over set-points"),
+        Merit("steady_state_error", "steady-state error", y, "|mean of r − y| over the last tenth of a set-point"),
+        Merit("violation_time", "violation time", "share", "share of steps outside the limits of y or of its change"),
+        Merit("violation_max", "largest violation", y, "largest excess over the limits"),
+        Merit("r_tilde_tv", "variation of r̃", y, "sum of |r̃ₖ − r̃ₖ₋₁| over an episode, the first move included"),
+        Merit("return", "return", "", "sum of the rewards of an episode"),
+    ]
+
+
+def figure(value: float | None) -> str:
+    """A number with three digits; a dash where there is none."""
+    if value is None:
+        return "–"
+    if 999.5 <= abs(value) < 1e6:
+        return f"{value:,.0f}"
+    return f"{value:#.3g}".rstrip(".")
+
+
+def ratio(value: float | None) -> str:
+    """A number as a multiple."""
+    return "–" if value is None else f"{figure(value)}×"
+
+
+def setting(value: Any) -> str:
+    """A setting, numbers without digits that say nothing."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def short(scenario: str) -> str:
+    """A scenario without its plant."""
+    return scenario.split("/", 1)[-1]
+
+
+def answer(comparison: Mapping[str, Any]) -> str:
+    """Two sentences: which policy is best, and how far from the limit it is."""
+    statistics, count = comparison["statistics"]["lines"], len({row["scenario"] for row in comparison["rows"]})
+    ranked = {label: line for label, line in statistics.items() if line["mean_rank"] is not None}
+    if not ranked:
+        return "No policy was ranked. There is nothing to compare the limit with."
+    by_rank = sorted(ranked, key=lambda label: ranked[label]["mean_rank"])
+    learned = [label for label in by_rank if ranked[label]["kind"] == "learned"]
+    about = learned[0] if learned else by_rank[0]
+    others = [label for label in by_rank if label not in (learned or [about])]
+    own, rank = ranked[about], figure(ranked[about]["mean_rank"])
+    place = f"the lowest MAE within the limits in {own['first']} of {_count(count, 'scenario')}, mean rank {rank}"
+    if not others:
+        first = f"{about} has {place}; nothing else was ranked"
+    else:
+        other, theirs = others[0], ranked[others[0]]
+        better, equal = own["mean_rank"] < theirs["mean_rank"], own["mean_rank"] == theirs["mean_rank"]
+        verdict = "is the best on the whole" if better else "shares the first place" if equal else "is not the best"
+        which = "the next" if better else "its equal" if equal else "the best"
+        against = f"{other}, {which}: {theirs['first']}, mean rank {figure(theirs['mean_rank'])}"
+        first = f"{about} {verdict}: {place} ({against})"
+    if own["unranked"]:
+        first += f"; it leaves the limits or diverges in {own['unranked']}"
+    return f"{first}. {_distance(own)}"
+
+
+def _distance(line: Mapping[str, Any]) -> str:
+    """The sentence about the limit."""
+    ratios = {short(name): found["median"] for name, found in line["scenarios"].items() if found["median"] is not None}
+    if not ratios:
+        return "How far it is from the limit is not known: the limit was not computed."
+    least, most = min(ratios, key=ratios.__getitem__), max(ratios, key=ratios.__getitem__)
+    if len(ratios) == 1:
+        return f"Its MAE is {ratio(ratios[least])} the limit's ({least})."
+    middle = ratio(float(np.median(list(ratios.values()))))
+    lost = f"; it diverged in {len(line['scenarios']) - len(ratios)}" if len(line["scenarios"]) > len(ratios) else ""
+    return (
+        f"Its MAE is {middle} the limit's in the median scenario, from {ratio(ratios[least])} ({least}) "
+        f"to {ratio(ratios[most])} ({most}){lost}."
+    )
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" + "s" * (n != 1)
+
+
+def _table(comparison: Mapping[str, Any], every: list[Line]) -> list[list[TableLine]]:
+    """The table of errors: learned and users' policies, rivals, and those that are not ranked."""
+    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
+    groups: list[list[TableLine]] = [[], [], []]
+    for line in every:
+        found = comparison["statistics"]["lines"][line.label]
+        remarks = {"limit": "the limit", "preview": "with preview"}
+        remark = remarks.get(line.kind, f"{found['seeds']} seeds" if found["seeds"] > 1 else "")
+        cells = [_cell(line, name) for name in names]
+        where = {"learned": 0, "user": 0, "rival": 1}.get(line.kind, 2)
+        groups[where].append(TableLine(line.label, line.kind, remark, cells, found["mean_rank"]))
+    return groups
+
+
+def _cell(line: Line, scenario: str) -> Cell:
+    rows = line.rows.get(scenario, [])
+    mae, limit = (line.median(scenario, key) for key in ("mae", "ratio_to_limit"))
+    if mae is None:
+        return Cell(None, None, False, "diverged" if rows else "", "")
+    outside, lost = sum(row["within_limits"] is False for row in rows), sum(bool(row.get("diverged")) for row in rows)
+    out = not line.within_limits(scenario)
+    why = [
+        f"{n} of {_count(len(rows), 'seed')} {what}"
+        for n, what in ((outside, "outside the limits"), (lost, "diverged"))
+    ]
+    best = any(row["best"] for row in rows)
+    said = "; ".join(text for text, n in zip(why, (outside, lost), strict=True) if n)
+    return Cell(mae, limit, out, "best" if best else "out" if out else "", said)
+
+
+def _radii(certificate: list[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Largest spectral radius by policy and scenario, and numbered notes."""
+    if not certificate:
+        return None
+    policies, names = (list(dict.fromkeys(row[key] for row in certificate)) for key in ("policy", "scenario"))
+    notes = list(dict.fromkeys(row["note"] for row in certificate if row["note"]))
+    cells: dict[str, list[dict[str, Any]]] = {}
+    for policy in policies:
+        for name in names:
+            rows = [row for row in certificate if (row["policy"], row["scenario"]) == (policy, name)]
+            radius = max((row["spectral_radius"] for row in rows if row["spectral_radius"] is not None), default=None)
+            own = sorted({notes.index(row["note"]) + 1 for row in rows if row["note"]})
+            cells.setdefault(policy, []).append(
+                {"radius": radius, "unstable": radius is not None and radius >= 1, "notes": own}
+            )
+    return {"scenarios": names, "cells": cells, "notes": notes}
+
+
+def _machine(machine: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What the results depend on, as pairs of text."""
+    found = []
+    for key, value in machine.items():
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{name} {item}" for name, item in value.items() if item not in ("", None))
+        found.append((key, str(value)))
+    return found
+
+
+def _image(path: Path) -> Image:
+    data = path.read_bytes()
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # the PNG's header
+    return Image(
+        "data:image/png;base64," + base64.b64encode(data).decode(), round(SCALE * width), round(SCALE * height)
+    )
+
+
+def _contents(comparison: Mapping[str, Any], figures: Mapping[str, Path]) -> list[tuple[str, str]]:
+    """Anchors and titles of the sections that are there."""
+    sections = {
+        "errors": "Errors",
+        "statistics": "Over seeds",
+        "responses": "Time responses",
+        "effort": "Effort" if "effort" in figures else "",
+        "sweeps": "Sweeps" if any(name.startswith("sweep ") for name in figures) else "",
+        "certificate": "Stability" if comparison["certificate"] else "",
+        "policies": "Policies",
+        "definitions": "Definitions",
+        "made": "How this was made",
+    }
+    return [(anchor, title) for anchor, title in sections.items() if title]
+
+
+def write(
+    path: Path, comparison: Mapping[str, Any], figures: Mapping[str, Path], responses: Mapping[str, Path]
+) -> Path:
+    """Write the page.
+
+    Args:
+        path: HTML file.
+        comparison: the content of comparison.json.
+        figures: PNGs by the ids of `jaxouter.evaluation.comparison.draw`; another key is a caption.
+        responses: PNG of the time responses, by scenario.
+
+    Returns:
+        `path`.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxouter.evaluation", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"figure": figure, "ratio": ratio, "short": short, "setting": setting}
+    every = lines(comparison["rows"], comparison["policies"])
+    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
+    known = {name: figures.get(name) for name in ("errors", "effort", "certificate")}
+    page = environment.get_template("report.html.j2").render(
+        plant=comparison["plant"],
+        unit=symbol(comparison["y_unit"]),
+        date=comparison["date"],
+        seconds=comparison["seconds"],
+        family_seed=comparison["family_seed"],
+        command=comparison.get("command", f"python -m jaxouter.compare {comparison['plant']}"),
+        machine=_machine(comparison["machine"]),
+        policies=dict(sorted(comparison["policies"].items(), key=lambda item: list(KIND_NAMES).index(item[1]["kind"]))),
+        kinds=KIND_NAMES,
+        statistics=comparison["statistics"],
+        answer=answer(comparison),
+        limited=bool(comparison["statistics"]["scenarios"]),
+        scenarios=names,
+        lines=every,
+        table=_table(comparison, every),
+        merits=merits(comparison["y_unit"], comparison["time_unit"]),
+        terms=TERMS,
+        radii=_radii(comparison["certificate"]),
+        contents=_contents(comparison, figures),
+        figures={name: _image(image) if image else None for name, image in known.items()},
+        sweeps=[(key.removeprefix("sweep "), _image(png)) for key, png in figures.items() if key.startswith("sweep ")],
+        further=[
+            (key, _image(png)) for key, png in figures.items() if key not in known and not key.startswith("sweep ")
+        ],
+        responses={name: _image(png) for name, png in responses.items()},
+        shown=next((name for name in names if name in responses), names[0]),
+        script=SCRIPT,
+        script_hash="sha256-" + base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode(),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page, encoding="utf-8")
+    return path

@@ -1,0 +1,133 @@
+"""`mpc`: linear model predictive control on a model identified from an exciting record.
+
+The model is an ARX model with dead time. In innovations form it is its own observer; a disturbance at its input, a
+random walk, is estimated along (offset-free). At each step a quadratic programme over the coming r~ is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
+from jaxouter.loop.identify import ARX
+from jaxouter.plants import Plant
+
+
+class Model(NamedTuple):
+    """x_(k+1) = A x_k + B (r~_k + d) + K e_k, y_k = C x_k + e_k, deviations included in d."""
+
+    A: np.ndarray  # (n, n)
+    B: np.ndarray  # (n,)
+    C: np.ndarray  # (n,)
+    K: np.ndarray  # (n,)
+    d: float  # disturbance at the input before anything is seen
+
+    @property
+    def gain(self) -> float:
+        """DC gain."""
+        return float(self.C @ np.linalg.solve(np.eye(len(self.A)) - self.A, self.B))
+
+
+def innovations_form(arx: ARX) -> Model:
+    """The ARX model as state space, in observer canonical form."""
+    n, size = len(arx.a), len(arx.a) + arx.dead
+    a, b = np.zeros(size), np.zeros(size)
+    a[:n], b[arx.dead :] = arx.a, arx.b
+    A = np.eye(size, k=1)
+    A[:, 0] = a
+    return Model(A, b, np.eye(size)[0], a, arx.c / arx.b.sum())
+
+
+class Settings(NamedTuple):
+    """What is tuned."""
+
+    horizon: int  # control steps
+    move_weight: float  # of squared moves of r~, in squared errors that their DC effect would be
+    disturbance: float  # its step a control step, as standard deviation; in those of e / DC gain
+    margin: float  # kept from the limits, in standard deviations of e
+
+
+class MPCParams(NamedTuple):
+    """The augmented model and the programme."""
+
+    A: np.ndarray  # (n + 1, n + 1), the last state is d
+    B: np.ndarray
+    C: np.ndarray
+    K: np.ndarray  # observer
+    d: float
+    programme: Condensed
+
+
+class Carry(NamedTuple):
+    """Observer and last r~."""
+
+    x: np.ndarray  # (n + 1,), of t_k, from what came before
+    r_tilde: float
+
+
+@dataclass(frozen=True)
+class MPC:
+    """Observer, then programme; no preview: the reference stays as it is."""
+
+    params: MPCParams
+    r_tilde_bounds: tuple[float, float]
+    host: bool = True
+
+    @cached_property
+    def _solver(self) -> Solver:
+        return Solver(self.params.programme)
+
+    def init(self, params: Any, r0: float, y0: float) -> Carry:
+        """In steady state at y_0."""
+        p = self.params
+        n = len(p.A) - 1
+        settled = np.linalg.solve(np.eye(n) - p.A[:n, :n], p.B[:n])
+        x = settled / float(p.C[:n] @ settled) * y0
+        return Carry(np.append(x, p.d), float(np.clip(y0, *self.r_tilde_bounds)))
+
+    def act(self, params: Any, carry: Carry, r: float, y: float, key: Any = None) -> tuple[Carry, float]:
+        """Correct the state by the innovation, solve, predict."""
+        p = self.params
+        free = p.A @ carry.x + p.K * (y - p.C @ carry.x)
+        u = self._solver(np.concatenate([free, [r, y, carry.r_tilde]]))[0]
+        return Carry(free + p.B * u, u), u
+
+
+def observer(model: Model, disturbance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, C of the model with its disturbance as last state, and the Kalman gain of one-step prediction."""
+    n = len(model.A)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n], A[:n, n], A[n, n] = model.A, model.B, 1.0
+    B, C, K = np.append(model.B, 0.0), np.append(model.C, 0.0), np.append(model.K, 0.0)
+    Q = np.outer(K, K)
+    Q[n, n] = (disturbance / model.gain) ** 2
+    P = scipy.linalg.solve_discrete_are(A.T, C[:, None], Q, np.eye(1), s=K[:, None])
+    return A, B, C, (A @ P @ C + K) / (C @ P @ C + 1.0)
+
+
+def controller(plant: Plant, model: Model, sigma: float, settings: Settings) -> MPC:
+    """The controller of a model."""
+    A, B, C, K = observer(model, settings.disturbance)
+    horizon, moves = settings.horizon, blocks(settings.horizon)
+    powers = [C]
+    for _ in range(horizon - 1):
+        powers.append(powers[-1] @ A)
+    impulse = np.array([row @ B for row in powers])
+    forced = scipy.linalg.toeplitz(impulse, np.zeros(horizon)) @ moves
+    size = len(A)
+    free = np.hstack([np.array(powers), np.zeros((horizon, 3))])  # z = [free state, r, y, last r~]
+    reference = np.zeros((horizon, size + 3))
+    reference[:, size] = 1.0
+    now, last = np.eye(size + 3)[size + 1], np.eye(size + 3)[size + 2]
+    steps = differences(moves.shape[1])
+    weight = settings.move_weight * model.gain**2
+    H = forced.T @ forced + weight * steps.T @ steps
+    F = forced.T @ (free - reference) - weight * np.outer(steps[0], last)
+    rows = limit_rows(plant, free, forced, now, settings.margin * sigma)
+    programme = Condensed(H, F, *plant.r_tilde_bounds, *rows)
+    return MPC(MPCParams(A, B, C, K, model.d, programme), plant.r_tilde_bounds)

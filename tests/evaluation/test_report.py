@@ -1,0 +1,277 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+from jaxouter.evaluation import comparison, report, scenarios, statistics
+from jaxouter.evaluation.evaluate import Named, evaluate, simple_policy
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import rollout
+from jaxouter.loop import identify
+from jaxouter.plants import make
+from jaxouter.training.run import surroundings
+
+HOSTILE = "<script>alert(1)</script> $x_$.py"
+SCENARIOS = ("pitch/paper", "pitch/steps")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+class Written(NamedTuple):
+    """A report and what it was made of."""
+
+    path: Path
+    comparison: dict
+
+
+def policies() -> dict[str, Named]:
+    hostile = Named(HOSTILE, *identify.static(*make("pitch"), jax.random.key(1)))
+    return {"none": simple_policy("none", "pitch"), "static": simple_policy("static", "pitch"), HOSTILE: hostile}
+
+
+def row(name: str, identifier: str, figures: dict, limit: float) -> dict:
+    ratio = figures["mae"] / limit
+    within = figures["violation_time"] <= 0.001
+    place = {"policy": name, "run": None, "seed": None, "scenario": identifier, "rank": None, "best": False}
+    return place | figures | {"ratio_to_limit": ratio, "ratio_to_bound": None, "within_limits": within}
+
+
+def swept(named: Named, axes: dict[str, list[float]]) -> dict:
+    """MAE on pitch/paper over one or two parameters."""
+    scenario = scenarios.get("pitch/paper", 1)
+
+    def error(**values: float) -> float:
+        parameters = replace(scenario.params, **{name: jnp.full(1, value) for name, value in values.items()})
+        return mae(rollout(named.policy, named.params, replace(scenario, params=parameters)))
+
+    first, *rest = axes
+    if not rest:
+        return {"values": [axes[first]], "mae": [error(**{first: v}) for v in axes[first]]}
+    grid = [[error(**{first: v, rest[0]: w}) for w in axes[rest[0]]] for v in axes[first]]
+    return {"values": list(axes.values()), "mae": grid}
+
+
+def sweep(named: dict[str, Named], kinds: dict, axes: dict[str, list[float]], nominal: float) -> dict:
+    content = {
+        "axes": [{"name": name, "unit": "s", "values": values, "nominal": nominal} for name, values in axes.items()],
+        "policies": {name: swept(each, axes) for name, each in named.items()},
+    }
+    return content | {"best_rival": statistics.best_rival(content, kinds)}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Written:
+    """Two scenarios, two sweeps, three policies, of which `static` stands in for the limit."""
+    folder, named = tmp_path_factory.mktemp("report"), policies()
+    note = {"steps": 1600, "seconds": 0.1, "settings": {"name": HOSTILE, "gain": 3.0}, "note": f"{HOSTILE} & more."}
+    kinds = {"none": note | {"kind": "rival"}, "static": note | {"kind": "limit"}, HOSTILE: note | {"kind": "user"}}
+    chosen = [scenarios.get(name, 2) for name in SCENARIOS]
+    results = {name: evaluate(each, chosen) for name, each in named.items()}
+    limits = {identifier: figures["mae"] for identifier, (_, figures) in results["static"].items()}
+    rows = [
+        row(name, identifier, figures, limits[identifier])
+        for name, found in results.items()
+        for identifier, (_, figures) in found.items()
+    ]
+    certificate = [
+        {"policy": name, "scenario": "pitch/paper", "set_point": point, "spectral_radius": radius, "note": remark}
+        for name, radius, remark in (("none", 0.99, ""), (HOSTILE, 1.01, HOSTILE))
+        for point in (-5.0, 5.0)
+    ]
+    content = {
+        "format": 1,
+        "plant": "pitch",
+        "y_unit": "crad",
+        "time_unit": "s",
+        "family_seed": 2024,
+        "seconds": 1.0,
+        "date": "2026-01-31",
+        "machine": surroundings(),
+        "policies": kinds,
+        "rows": statistics.ranks(rows, kinds),
+        "statistics": statistics.summarise(rows, kinds),
+        "sweeps": {
+            "pitch/pilot-delay": sweep(named, kinds, {"tau": [0.0, 0.5, 1.0]}, 0.5),
+            "pitch/controller-delays": sweep(named, kinds, {"d1": [0.0, 0.5], "d2": [0.0, 0.3, 0.6]}, 0.0),
+        },
+        "certificate": certificate,
+    }
+    responses = {
+        scenario.id: comparison.responses(
+            folder / f"{i}.png", scenario, {name: results[name][scenario.id][0] for name in named}, list(named)
+        )
+        for i, scenario in enumerate(chosen)
+    }
+    figures = comparison.draw(folder, content)
+    return Written(report.write(folder / "report.html", content, figures, responses), content)
+
+
+@pytest.fixture(scope="module")
+def chromium(request):
+    if CHROMIUM is None:
+        absent = "there is no Chromium here to open the report in (Debian: apt-get install chromium)"
+        if request.config.getoption("--all"):
+            pytest.fail(absent)
+        pytest.skip(absent)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(params=[1280, 390], ids=["laptop", "phone"])
+def page(request, chromium, written):
+    """The report, opened; whatever the browser complains about or asks the network for fails the test."""
+    context = chromium.new_context(viewport={"width": request.param, "height": 844})
+    page, complaints, requests = context.new_page(), [], []
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("dialog", lambda dialog: (complaints.append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda asked: requests.append(asked.url))
+    page.goto(written.path.as_uri())
+    yield page
+    assert complaints == []
+    assert written.path.as_uri() in requests
+    assert [url for url in requests if url != written.path.as_uri() and not url.startswith("data:")] == []
+    context.close()
+
+
+def overflow(page: Page) -> int:
+    return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+
+
+def test_every_picture_is_seen(page, written):
+    images = page.locator("img").all()
+    assert len(images) == 2 + len(written.comparison["sweeps"]) + 1 + 1  # errors, effort, sweeps, certificate, response
+    for image in images:
+        assert image.is_visible()
+        assert image.evaluate("image => image.complete && image.naturalWidth") > 100
+        assert image.bounding_box()["width"] > 300
+        assert image.get_attribute("alt")
+
+
+def test_page_never_scrolls_sideways_but_its_wide_tables_do(page):
+    assert overflow(page) == 0
+    box = page.get_by_role("region", name="Figures of merit on pitch/paper")
+    hidden = box.evaluate("box => box.scrollWidth - box.clientWidth")
+    assert hidden > 0
+    first = box.locator("tbody th").first
+    before = first.bounding_box()["x"]
+    box.evaluate("box => box.scrollLeft = 200")
+    assert first.bounding_box()["x"] == pytest.approx(before, abs=1)
+
+
+def test_scenario_is_chosen_with_the_keyboard(page):
+    image, select = page.locator("#response"), page.get_by_label("Scenario", exact=True)
+    before = image.get_attribute("src")
+    assert page.get_by_role("region", name="Figures of merit on pitch/paper").is_visible()
+    select.focus()
+    page.keyboard.press("ArrowDown")
+    assert select.locator("option:checked").inner_text() == "pitch/steps"
+    assert image.get_attribute("src") != before
+    assert "pitch/steps" in image.get_attribute("alt")
+    image.evaluate("image => image.decode()")
+    assert image.evaluate("image => image.naturalWidth") > 100
+    assert page.get_by_role("region", name="Figures of merit on pitch/steps").is_visible()
+    assert not page.get_by_role("region", name="Figures of merit on pitch/paper").is_visible()
+    assert overflow(page) == 0
+
+
+def test_hostile_names_stay_text(page):
+    assert page.evaluate("document.scripts.length") == 1
+    assert page.locator("section#errors th", has_text=HOSTILE).count() == 1
+    assert page.locator("section#policies td", has_text=f"{HOSTILE} & more.").count() == 3
+    assert page.locator("section#certificate li", has_text=HOSTILE).count() == 1
+
+
+def test_errors_show_mae_or_ratio(page, written):
+    cell = page.locator("section#errors tbody tr", has_text="none").locator("td").first
+    found = next(r for r in written.comparison["rows"] if (r["policy"], r["scenario"]) == ("none", "pitch/paper"))
+    mae, ratio = report.figure(found["mae"]), report.ratio(found["ratio_to_limit"])
+    assert mae == "10.9"
+    assert cell.inner_text().split() == [mae, ratio]
+    page.get_by_label("MAE", exact=True).check()
+    assert cell.inner_text().split() == [mae]
+    page.get_by_label("ratio to the limit", exact=True).check()
+    assert cell.inner_text().split() == [ratio]
+
+
+def test_page_is_one_file_in_both_colour_schemes(chromium, written):
+    inks = []
+    for scheme in ("light", "dark"):
+        page = chromium.new_page(color_scheme=scheme)
+        page.goto(written.path.as_uri())
+        colours = [page.evaluate(f"getComputedStyle(document.body).{name}") for name in ("color", "backgroundColor")]
+        assert colours[0] != colours[1]
+        assert page.locator("figure .box").first.evaluate("b => getComputedStyle(b).backgroundColor") == (
+            "rgb(255, 255, 255)"
+        )
+        inks.append(colours[0])
+        page.close()
+    assert inks[0] != inks[1]
+
+
+def test_answer_says_who_is_best_and_how_far_from_the_limit(written):
+    said = report.answer(written.comparison)
+    assert said.startswith(f"{HOSTILE} is the best on the whole: the lowest MAE within the limits in 2 of 2 scenarios")
+    assert "(none, the next: 0, mean rank 2.00). Its MAE is " in said
+    assert said.endswith(").")
+
+
+def line(kind, mean_rank, first, unranked=0, ratios=()):
+    found = {f"pitch/{i}": {"median": value} for i, value in enumerate(ratios)}
+    return {"kind": kind, "mean_rank": mean_rank, "first": first, "unranked": unranked, "scenarios": found}
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (
+            {"pi": line("rival", 1.2, 3), "learned": line("learned", 1.8, 1, 2, (1.5, None, 1.1, 1.2))},
+            "learned is not the best: the lowest MAE within the limits in 1 of 4 scenarios, mean rank 1.80 (pi, the "
+            "best: 3, mean rank 1.20); it leaves the limits or diverges in 2. Its MAE is 1.20× the limit's in the "
+            "median scenario, from 1.10× (2) to 1.50× (0); it diverged in 1.",
+        ),
+        (
+            {"learned": line("learned", 1.0, 4)},
+            "learned has the lowest MAE within the limits in 4 of 4 scenarios, mean rank 1.00; nothing else was "
+            "ranked. How far it is from the limit is not known: the limit was not computed.",
+        ),
+        (
+            {"learned": line("learned", 1.5, 2, ratios=(1.25,)), "pi": line("rival", 1.5, 2)},
+            "learned shares the first place: the lowest MAE within the limits in 2 of 4 scenarios, mean rank 1.50 "
+            "(pi, its equal: 2, mean rank 1.50). Its MAE is 1.25× the limit's (0).",
+        ),
+    ],
+)
+def test_answer_in_every_case(lines, said):
+    rows = [{"scenario": f"pitch/{i}"} for i in range(4)]
+    assert report.answer({"rows": rows, "statistics": {"lines": lines}}) == said
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (0.0, "0.00"),
+        (0.04567, "0.0457"),
+        (3.14159, "3.14"),
+        (136.2, "136"),
+        (999.7, "1,000"),
+        (2e7, "2.00e+07"),
+    ],
+)
+def test_figures_have_three_digits(value, text):
+    assert report.figure(value) == text
+
+
+def test_styles_hold_when_a_policy_is_added():
+    names = ["learned a", "learned b", "pi", "x.py", "y.py", "oracle"]
+    look = comparison.styles(names)
+    assert len({(style.color, str(style.ls)) for style in look.values()}) == len(names)
+    assert comparison.styles([*names, "z.py"]).items() >= look.items()
+    assert comparison.styles(["pi"])["pi"] == look["pi"]
