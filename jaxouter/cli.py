@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from jaxouter import plants
-from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import SIMPLE
+from jaxouter.evaluation import cache, scenarios, sweeps
+from jaxouter.evaluation.rivals import NAMES
 from jaxouter.training.config import PRESETS, TrainConfig
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
@@ -47,17 +45,17 @@ def run(main: Callable[[], None]) -> None:
 def use_compilation_cache() -> None:
     """Keep compiled functions in the user's cache folder, unless JAX is told otherwise."""
     if not jax.config.values["jax_compilation_cache_dir"]:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "jaxouter" / "xla"))
+        jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "xla"))
 
 
 def print_lists() -> None:
-    """Plants, presets, scenarios and policies."""
+    """Plants, presets, scenarios, sweeps and policies."""
     for name in plants.REGISTRY:
         console.print(f"[bold]{name}[/bold]")
         console.print("  presets:   " + ", ".join(PRESETS.get(name, PRESETS["pitch"])))
         console.print("  scenarios: " + ", ".join(scenarios.catalogue(name)))
-    console.print("policies: a run folder, " + ", ".join(SIMPLE))
+        console.print("  sweeps:    " + ", ".join(sweeps.catalogue(name)))
+    console.print("policies: a run folder, " + ", ".join(NAMES))
 
 
 class Interrupt:
@@ -126,6 +124,42 @@ class TrainingProgress:
             left = (now - self._begin) / max(1, epoch - self._first) * (cfg.epochs - epoch)
             print(f"seed {seed}  epoch {epoch}/{cfg.epochs}  {text}  {left:.0f} s left", flush=True)
             self._last = now
+
+
+class JobProgress:
+    """A live bar over many jobs on a terminal, plain lines elsewhere; on both what a long one says meanwhile."""
+
+    def __init__(self, total: int) -> None:
+        self._bar = Progress(
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=total)
+        self._done, self._total, self._last = 0, total, time.monotonic()
+
+    def __enter__(self) -> JobProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """What one of the jobs is at."""
+        self._bar.update(self._task, description=text)
+        if not console.is_terminal and time.monotonic() - self._last >= LINE_SECONDS:
+            print(f"{self._done}/{self._total} jobs  {text}", flush=True)
+            self._last = time.monotonic()
+
+    def advance(self, text: str) -> None:
+        """One more is done."""
+        self._done += 1
+        self._bar.advance(self._task)
+        self.say(text)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -1,4 +1,4 @@
-"""`python -m jaxouter.evaluate`: a trained run, or a simple policy, on any evaluation scenario."""
+"""`python -m jaxouter.evaluate`: a trained run, or a rival, on any evaluation scenario."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import SIMPLE, Named, Results, evaluate, result, simple_policy
-from jaxouter.training.run import Run, write_json
+from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
+from jaxouter.evaluation.rivals import RIVALS
+from jaxouter.training.run import open_run, write_json
 
 SHOWN = (
     "mae",
@@ -29,7 +30,7 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Options:
-    """Evaluate a trained run, or a named simple policy, on scenarios that training never saw.
+    """Evaluate a trained run, or a rival, on scenarios that training never saw.
 
     With a run folder the learned policy of its median seed is evaluated; a folder seed-N in it names another seed.
     Without `--scenario` all scenarios of the plant are met, without a folder those of every plant.
@@ -38,7 +39,7 @@ class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder, or the folder of one seed in it."""
     policy: str | None = None
-    """A simple policy instead: none (r~ = r) or static (inverse of the identified DC gain)."""
+    """A rival instead, such as none (r~ = r) or static (inverse of the DC gain); identified first, once."""
     scenario: tuple[str, ...] = ()
     """Scenarios, such as pitch/paper; see --list."""
     episodes: int | None = None
@@ -93,9 +94,9 @@ def check(options: Options) -> None:
         ValueError: the options do not fit together, or name what does not exist.
     """
     if options.run is None and options.policy is None:
-        raise ValueError(f"say what to evaluate: a run folder, or --policy with one of {', '.join(SIMPLE)}")
-    if options.policy is not None and options.policy not in SIMPLE:
-        raise ValueError(f"there is no policy {options.policy!r}; the policies are: {', '.join(SIMPLE)}")
+        raise ValueError(f"say what to evaluate: a run folder, or --policy with one of {', '.join(RIVALS)}")
+    if options.policy is not None and options.policy not in RIVALS:
+        raise ValueError(f"there is no policy {options.policy!r}; the policies are: {', '.join(RIVALS)}")
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
     if not 0 <= options.family_seed < 2**32:
@@ -116,30 +117,13 @@ def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
     if options.policy is not None:
         given = {name.split("/")[0] for name in options.scenario} or set(plants.REGISTRY)
         names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
-        return {name: simple_policy(options.policy, name) for name in names}, {}
+        return {name: rival(options.policy, name) for name in names}, {}
     assert options.run is not None  # as `check` found
-    run, seed = open_run(options.run)
+    run, seed, _ = open_run(options.run)
     state, _ = run.load(seed)
     trainer, _ = run.trainer
     named = Named("learned", trainer.policy, trainer.policy_params(state))
     return {run.config.plant: named}, {"run": str(run.path), "seed": seed}
-
-
-def open_run(path: Path) -> tuple[Run, int]:
-    """The run in a folder and its median seed, or the seed whose folder it is.
-
-    Raises:
-        ValueError: the folder is no run.
-    """
-    name = path.resolve().name
-    if name.startswith("seed-") and not (path / "config.json").exists():
-        run = Run.open(path.resolve().parent)
-        seed = next((seed for seed in run.seeds if run.seed_folder(seed).name == name), None)
-        if seed is None:
-            raise ValueError(f"{path} is not a seed of its run, which has: {', '.join(map(str, run.seeds))}")
-        return run, seed
-    run = Run.open(path)
-    return run, run.median_seed()
 
 
 def show(policy: str, results: Results) -> None:

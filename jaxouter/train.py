@@ -15,8 +15,9 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import SIMPLE, Named, Results, evaluate, result, simple_policy
+from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.training.config import TrainConfig, preset
 from jaxouter.training.run import FORMAT, Run, write_json
@@ -86,7 +87,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, _) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
-    simple = {name: simple_policy(name, plant) for name in SIMPLE}
+    simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
     simple_results = {name: evaluate(named, met, record_members=True) for name, named in simple.items()}
     learned = {seed: evaluate(named, met, record_members=True) for seed, named in policies.items()}

@@ -6,16 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-
 from jaxouter.evaluation.metrics import figures_of_merit, mae
+from jaxouter.evaluation.rivals import RIVALS, identified
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.loop import identify
 from jaxouter.loop.policy import Policy, none
 from jaxouter.plants import make
 
-SIMPLE = ("none", "static")
 Results = dict[str, tuple[Traces, dict[str, Any]]]  # by the scenario's id
 
 
@@ -28,18 +25,14 @@ class Named:
     params: Any
 
 
-def simple_policy(name: str, plant_name: str) -> Named:
-    """The policy `none`, or `static` identified on the nominal plant by 8 constant-r~ episodes.
+def rival(name: str, plant_name: str) -> Named:
+    """A rival, identified on the nominal plant unless the cache has it.
 
     Raises:
         ValueError: unknown name; lists those that exist.
     """
-    plant, params = make(plant_name)
-    if name == "none":
-        return Named(name, *none(plant))
-    if name == "static":
-        return Named(name, *identify.static(plant, params, jax.random.key(0)))
-    raise ValueError(f"there is no policy {name!r}; the policies are: {', '.join(SIMPLE)}")
+    tuned = identified(name, plant_name)
+    return Named(name, *RIVALS[name].build(make(plant_name)[0], tuned))
 
 
 def evaluate(named: Named, scenarios: Iterable[Scenario], record_members: bool = False) -> Results:

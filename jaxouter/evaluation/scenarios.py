@@ -186,3 +186,12 @@ def paper_scenarios(name: str) -> list[str]:
     if name == "heaters":
         return ["heaters/paper-4", "heaters/paper-1000"]
     return list(catalogue(name))
+
+
+def stability_scenarios(name: str) -> list[str]:
+    """Ids of the scenarios that stand for the plants whose local stability differs; of other plants the first."""
+    own = {
+        "pitch": ["paper", "delay-0.57", "delay-5.7", "delay-swapped", "uncertainty"],
+        "heaters": ["paper-4", "riccati", "mixed-stock"],
+    }.get(name)
+    return [f"{name}/{key}" for key in own] if own else list(catalogue(name))[:1]

@@ -145,12 +145,8 @@ def catalogue(name: str) -> dict[str, Builder]:
     return dict(own.get(name, []))
 
 
-def get(identifier: str, coarse: bool = False) -> Sweep:
-    """The sweep called `identifier`, such as `pitch/pilot-delay`.
-
-    Args:
-        identifier: plant/sweep.
-        coarse: a few of its values only, for policies that solve a program at each step.
+def builder(identifier: str) -> Builder:
+    """The function that makes the sweep called `identifier`, such as `pitch/pilot-delay`.
 
     Raises:
         ValueError: there is no such plant or sweep; lists those that exist.
@@ -159,4 +155,17 @@ def get(identifier: str, coarse: bool = False) -> Sweep:
     sweeps = catalogue(name)
     if identifier not in sweeps:
         raise ValueError(f"there is no sweep {identifier!r}; {name} has: {', '.join(sweeps) or 'none'}")
-    return sweeps[identifier](coarse)
+    return sweeps[identifier]
+
+
+def get(identifier: str, coarse: bool = False) -> Sweep:
+    """The sweep called `identifier`.
+
+    Args:
+        identifier: plant/sweep.
+        coarse: a few of its values only, for policies that solve a program at each step.
+
+    Raises:
+        ValueError: there is no such plant or sweep; lists those that exist.
+    """
+    return builder(identifier)(coarse)

@@ -62,7 +62,7 @@ class Record(NamedTuple):
 
 
 def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Record:
-    """Input and output under random r~: levels over the whole range of r~, held long in some episodes, briefly in others.
+    """Input and output under random r~: levels over its whole range, held long in some episodes, briefly in others.
 
     Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
     log-uniform from four times an episode to every other step.

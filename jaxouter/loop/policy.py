@@ -26,13 +26,11 @@ class Policy(Protocol):
         """Whether it is plain NumPy or Python."""
         ...
 
-    def init(self, params: Any, r0: jax.Array, y0: jax.Array) -> Any:
+    def init(self, params: Any, r0: Any, y0: Any) -> Any:
         """Carry before the first step, from the first reference and output."""
         ...
 
-    def act(
-        self, params: Any, carry: Any, r: jax.Array, y: jax.Array, key: chex.PRNGKey | None = None
-    ) -> tuple[Any, jax.Array]:
+    def act(self, params: Any, carry: Any, r: Any, y: Any, key: chex.PRNGKey | None = None) -> tuple[Any, Any]:
         """At t_k, from r_k and y_k: the next carry and r~_k (scalar, within its bounds)."""
         ...
 

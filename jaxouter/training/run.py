@@ -141,6 +141,23 @@ class Run:
         partial.replace(path)
 
 
+def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
+    """The run in a folder, its median seed and all its seeds; of the folder of one seed that one alone.
+
+    Raises:
+        ValueError: the folder is no run.
+    """
+    name = path.resolve().name
+    if name.startswith("seed-") and not (path / "config.json").exists():
+        run = Run.open(path.resolve().parent)
+        seed = next((seed for seed in run.seeds if run.seed_folder(seed).name == name), None)
+        if seed is None:
+            raise ValueError(f"{path} is not a seed of its run, which has: {', '.join(map(str, run.seeds))}")
+        return run, seed, (seed,)
+    run = Run.open(path)
+    return run, run.median_seed(), tuple(run.seeds)
+
+
 def surroundings() -> dict[str, Any]:
     """What a result depends on beside the configuration."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 from jaxouter.evaluation import comparison, report, scenarios, statistics
-from jaxouter.evaluation.evaluate import Named, evaluate, simple_policy
+from jaxouter.evaluation.evaluate import Named, evaluate, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop import identify
@@ -30,7 +30,7 @@ class Written(NamedTuple):
 
 def policies() -> dict[str, Named]:
     hostile = Named(HOSTILE, *identify.static(*make("pitch"), jax.random.key(1)))
-    return {"none": simple_policy("none", "pitch"), "static": simple_policy("static", "pitch"), HOSTILE: hostile}
+    return {"none": rival("none", "pitch"), "static": rival("static", "pitch"), HOSTILE: hostile}
 
 
 def row(name: str, identifier: str, figures: dict, limit: float) -> dict:

@@ -19,11 +19,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import chex
+import jax
 import numpy as np
 
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.rivals.mpc import RECORD
 from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
-from jaxouter.loop.identify import Record
+from jaxouter.evaluation.rivals.tuning import Report, coordinate_search, score, training_episodes
+from jaxouter.loop.identify import LEVELS, Record, dc_gain, record
 from jaxouter.plants import Plant
+
+RANK = 1e-6  # singular values below this share of the largest count as zero
 
 
 class Settings(NamedTuple):
@@ -80,14 +87,14 @@ def windows(data: Record, past: int, horizon: int) -> tuple[np.ndarray, np.ndarr
     return np.vstack([rows(moves, back), rows(data.y, back + 1), rows(moves, ahead)]), rows(data.y, ahead + 1)
 
 
-def controller(plant: Plant, data: Record, gain: float, settings: Settings, ridge=1e-6) -> DeePC:
+def controller(plant: Plant, data: Record, gain: float, settings: Settings) -> DeePC:
     """The controller that a record gives, its costs scaled by the DC gain of the plant."""
     past, horizon = settings.past, settings.horizon
     given, future = windows(data, past, horizon)
     count = given.shape[1]
-    L = np.linalg.qr(np.vstack([given, future]).T / np.sqrt(count), mode="r").T
+    L = np.asarray(np.linalg.qr(np.vstack([given, future]).T / np.sqrt(count), mode="r")).T
     L11, L21, L22 = L[: len(given), : len(given)], L[len(given) :, : len(given)], L[len(given) :, len(given) :]
-    predictor = L21 @ np.linalg.pinv(L11, rcond=ridge)  # future y of what is given
+    predictor = L21 @ np.linalg.pinv(L11, rcond=RANK)  # future y of what is given
     W = np.linalg.inv(np.eye(horizon) + L22 @ L22.T / (settings.g_weight * np.mean(data.y**2)))
 
     # z = [past moves, past y, r, last r~]; moves = steps u - first * last r~, from the levels u of a few blocks.
@@ -103,3 +110,35 @@ def controller(plant: Plant, data: Record, gain: float, settings: Settings, ridg
     F = forced.T @ W @ (free - reference) - weight * np.outer(steps[0], last)
     rows = limit_rows(plant, free, forced, np.eye(size)[2 * past - 1], settings.margin * abs(L22[0, 0]))
     return DeePC(Condensed(H, F, *plant.r_tilde_bounds, *rows), past, plant.r_tilde_bounds)
+
+
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """A record, then the settings with the greatest return on training episodes; the keys give `mpc` the same ones."""
+    key_record, key_episodes = jax.random.split(key)
+    data = record(plant, params, key_record, RECORD)
+    gain = float(dc_gain(plant, params, key_record).gain)
+    episodes = training_episodes(plant, params, key_episodes)
+    spent = data.r_tilde.size + LEVELS * plant.episode_steps
+    horizons = [round(plant.episode_steps * share) for share in (0.1, 0.15, 0.2, 0.3)]
+    grid = {
+        "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
+        "g_weight": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0),
+        "past": (1, 2, 3, 5, 8, 12, 16, 20),
+        "horizon": horizons,
+        "margin": (0.0, 1.0, 2.0, 3.0),
+    }
+    start = {"move_weight": 0.1, "g_weight": 1e-2, "past": 12, "horizon": horizons[2], "margin": 1.0}
+
+    def value(settings: dict[str, Any]) -> float:
+        return score(controller(plant, data, gain, Settings(**settings)), (), episodes)
+
+    found, tried = coordinate_search(value, grid, start, (budget - spent) // episodes.r.size, report)
+    arrays = {"r_tilde": data.r_tilde, "y": data.y}
+    return Tuned(found | {"gain": gain}, arrays, spent + tried * episodes.r.size)
+
+
+def build(plant: Plant, tuned: Tuned) -> tuple[DeePC, tuple[()]]:
+    """The policy from what `tune` found."""
+    settings = dict(tuned.settings)
+    gain = settings.pop("gain")
+    return controller(plant, Record(tuned.arrays["r_tilde"], tuned.arrays["y"]), gain, Settings(**settings)), ()

@@ -22,7 +22,8 @@ import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxouter.agents.networks import Actor
-from jaxouter.evaluation.rivals.tuning import EPISODES, Report, Tuned, score, training_episodes
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.rivals.tuning import EPISODES, Report, score, training_episodes
 from jaxouter.loop.identify import Record, record
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.plants import Plant
@@ -95,7 +96,7 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
     return jax.lax.scan(update, (params, adam.init(params)), jax.random.split(key_batches, UPDATES))[0][0]
 
 
-def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report = lambda text: None) -> Tuned:
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """A network for each of some h, on a record as long as the budget allows; the one with the greatest return."""
     key_record, key_fit, key_episodes = jax.random.split(key, 3)
     episodes = training_episodes(plant, params, key_episodes)

@@ -10,12 +10,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import chex
+import jax
 import numpy as np
 import scipy.linalg
 
+from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
-from jaxouter.loop.identify import ARX
+from jaxouter.evaluation.rivals.tuning import Report, coordinate_search, score, training_episodes
+from jaxouter.loop.identify import ARX, Record, fit_arx, prediction_error, record
 from jaxouter.plants import Plant
+
+RECORD = 50  # episodes of the record
+ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
+PARSIMONY = 1e-3  # prediction error, as share of the standard deviation of y, that a smaller order may cost
+NOISE = 1e-3  # of the sensor that the observer expects, standard deviation as share of the range of set-points
 
 
 class Model(NamedTuple):
@@ -48,7 +57,7 @@ class Settings(NamedTuple):
 
     horizon: int  # control steps
     move_weight: float  # of squared moves of r~, in squared errors that their DC effect would be
-    disturbance: float  # its step a control step, as standard deviation; in those of e / DC gain
+    disturbance: float  # standard deviation of its step, as share of the range of r~
     margin: float  # kept from the limits, in standard deviations of e
 
 
@@ -98,21 +107,30 @@ class MPC:
         return Carry(free + p.B * u, u), u
 
 
-def observer(model: Model, disturbance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, C of the model with its disturbance as last state, and the Kalman gain of one-step prediction."""
+def observer(
+    model: Model, sigma: float, disturbance: float, noise: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, C of the model with its disturbance as last state, and the Kalman gain of one-step prediction.
+
+    Args:
+        model: with innovations e.
+        sigma, disturbance, noise: standard deviations of e, of a step of d, and of the sensor.
+    """
     n = len(model.A)
     A = np.zeros((n + 1, n + 1))
     A[:n, :n], A[:n, n], A[n, n] = model.A, model.B, 1.0
     B, C, K = np.append(model.B, 0.0), np.append(model.C, 0.0), np.append(model.K, 0.0)
-    Q = np.outer(K, K)
-    Q[n, n] = (disturbance / model.gain) ** 2
-    P = scipy.linalg.solve_discrete_are(A.T, C[:, None], Q, np.eye(1), s=K[:, None])
-    return A, B, C, (A @ P @ C + K) / (C @ P @ C + 1.0)
+    e, v, d = (np.array([sigma, noise, disturbance]) / np.hypot(sigma, noise)) ** 2  # only their ratios matter
+    Q = e * np.outer(K, K)
+    Q[n, n] = d
+    P = scipy.linalg.solve_discrete_are(A.T, C[:, None], Q, np.eye(1) * (e + v), s=e * K[:, None])
+    return A, B, C, (A @ P @ C + e * K) / (C @ P @ C + e + v)
 
 
 def controller(plant: Plant, model: Model, sigma: float, settings: Settings) -> MPC:
     """The controller of a model."""
-    A, B, C, K = observer(model, settings.disturbance)
+    span, width = np.diff(plant.setpoint_range)[0], np.diff(plant.r_tilde_bounds)[0]
+    A, B, C, K = observer(model, sigma, settings.disturbance * width, NOISE * span)
     horizon, moves = settings.horizon, blocks(settings.horizon)
     powers = [C]
     for _ in range(horizon - 1):
@@ -131,3 +149,56 @@ def controller(plant: Plant, model: Model, sigma: float, settings: Settings) -> 
     rows = limit_rows(plant, free, forced, now, settings.margin * sigma)
     programme = Condensed(H, F, *plant.r_tilde_bounds, *rows)
     return MPC(MPCParams(A, B, C, K, model.d, programme), plant.r_tilde_bounds)
+
+
+def identify_model(data: Record, horizon: int) -> ARX:
+    """Order and dead time with the least error of prediction over the horizon on the last quarter of the record.
+
+    Of the orders that predict about as well the smallest is taken, and fitted again to the whole record.
+    """
+    kept = 3 * len(data.y) // 4
+    fitted, held_out = (Record(data.r_tilde[part], data.y[part]) for part in (slice(kept), slice(kept, None)))
+    candidates = [fit_arx(fitted, n, dead) for n in ORDERS for dead in range(data.r_tilde.shape[1] // 20 + 1)]
+    errors = [prediction_error(model, held_out, horizon) for model in candidates]
+    enough = min(errors) * 1.01 + PARSIMONY * float(np.std(held_out.y))
+    best = min((model for model, error in zip(candidates, errors, strict=True) if error <= enough), key=complexity)
+    return fit_arx(data, len(best.a), best.dead)
+
+
+def complexity(model: ARX) -> tuple[int, int]:
+    """Number of coefficients, then dead time."""
+    return len(model.a), model.dead
+
+
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """Model, then the settings with the greatest return on training episodes."""
+    key_record, key_episodes = jax.random.split(key)
+    data = record(plant, params, key_record, RECORD)
+    horizons = [round(plant.episode_steps * share) for share in (0.1, 0.15, 0.2, 0.3)]
+    report("identifying")
+    arx = identify_model(data, horizons[-1])
+    model = innovations_form(arx)
+    episodes = training_episodes(plant, params, key_episodes)
+    most = (budget - data.r_tilde.size) // episodes.r.size
+    grid = {
+        "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
+        "disturbance": (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1),
+        "horizon": horizons,
+        "margin": (0.0, 1.0, 2.0, 3.0),
+    }
+    start = {"move_weight": 0.1, "disturbance": 1e-3, "horizon": horizons[2], "margin": 1.0}
+
+    def value(settings: dict[str, Any]) -> float:
+        return score(controller(plant, model, arx.sigma, Settings(**settings)), (), episodes)
+
+    found, spent = coordinate_search(value, grid, start, most, report)
+    settings = found | {"dead": arx.dead, "c": arx.c, "sigma": arx.sigma}
+    return Tuned(settings, {"a": arx.a, "b": arx.b}, data.r_tilde.size + spent * episodes.r.size)
+
+
+def build(plant: Plant, tuned: Tuned) -> tuple[MPC, tuple[()]]:
+    """The policy from what `tune` found."""
+    settings = dict(tuned.settings)
+    dead, c, sigma = (settings.pop(name) for name in ("dead", "c", "sigma"))
+    model = innovations_form(ARX(tuned.arrays["a"], tuned.arrays["b"], c, dead, sigma))
+    return controller(plant, model, sigma, Settings(**settings)), ()

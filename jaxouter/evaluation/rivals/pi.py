@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from jaxouter.evaluation.rivals.tuning import Report, Tuned, score, training_episodes
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.rivals.tuning import Report, score, training_episodes
 from jaxouter.loop import identify
 from jaxouter.loop.identify import static
 from jaxouter.loop.policy import AffineParams
@@ -52,11 +53,11 @@ class PI:
         return jnp.where(further, carry, integral), jnp.clip(wanted, low, high)
 
 
-def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report = lambda text: None) -> Tuned:
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """Gains with the greatest return on training episodes, by COBYQA (scipy), within `budget` environment steps.
 
-    The search runs over asinh of kp G and of ki G times the episode, G the identified DC gain, so that it reaches far and
-    is fine near zero; it starts from a gentle controller.
+    The search runs over asinh of kp G and of ki G times the episode, G the identified DC gain, so that it reaches far
+    and is fine near zero; it starts from a gentle controller.
     """
     key_static, key_episodes = jax.random.split(key)
     _, prior = static(plant, params, key_static)
@@ -75,11 +76,16 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         report(f"{len(best)} tried")
         return -best[-1][0] if np.isfinite(best[-1][0]) else 1e6
 
-    bounds = scipy.optimize.Bounds([-2.0, -2.0], [5.0, 6.0])
+    bounds = [(-2.0, 5.0), (-2.0, 6.0)]
     options = {"maxfev": (budget - spent) // each, "initial_tr_radius": 0.5, "final_tr_radius": 1e-3}
     scipy.optimize.minimize(loss, [0.5, 0.2], method="COBYQA", bounds=bounds, options=options)
     _, found = max(best, key=lambda tried: tried[0])
-    settings = {"kp": float(found.kp), "ki": float(found.ki), "slope": float(prior.slope), "offset": float(prior.offset)}
+    settings = {
+        "kp": float(found.kp),
+        "ki": float(found.ki),
+        "slope": float(prior.slope),
+        "offset": float(prior.offset),
+    }
     return Tuned(settings, {}, spent + len(best) * each)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -22,23 +22,23 @@ EPISODES = 16
 Report = Callable[[str], None]
 
 
-class Tuned(NamedTuple):
-    """What identification and tuning found: plain values, from which the policy is built, and what that cost."""
-
-    settings: dict[str, Any]  # as JSON
-    arrays: dict[str, np.ndarray]
-    steps: int  # environment steps
-
-
 def set_points(key: chex.PRNGKey, plant: Plant, steps: int) -> jax.Array:
-    """Reference of a training episode, (steps,): one set-point in half of them, else redrawn at random times.
+    """Reference of a training episode, (steps,): set-points of the plant's range, redrawn at random times.
 
-    The probability of a redraw is log-uniform from one to twenty an episode.
+    A third of the episodes keep one set-point. In a third it is redrawn, with a probability that is log-uniform from
+    one to twenty times an episode. In a third it is redrawn at each step near the one before: a random walk, reflected
+    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range.
     """
-    key_rate, key_one, key_run = jax.random.split(key, 3)
-    rate = jnp.exp(jax.random.uniform(key_rate, (), float, 0.0, jnp.log(20.0))) / plant.episode_steps
-    one = jax.random.bernoulli(key_one)
-    return telegraph(key_run, steps, *plant.setpoint_range, jnp.where(one, 0.0, rate))
+    key_kind, key_rate, key_run = jax.random.split(key, 3)
+    low, high = plant.setpoint_range
+    share = jax.random.uniform(key_rate, (), float)
+    rate = 20.0**share / plant.episode_steps
+    first = telegraph(key_run, steps, low, high, 0.0)
+    moves = 0.0025 * 20.0**share * jax.random.normal(key_run, (steps,), float)
+    walk = (first[0] - low) / (high - low) + jnp.cumsum(moves)
+    reflected = low + (high - low) * jnp.abs((walk + 1.0) % 2.0 - 1.0)
+    kind = jax.random.randint(key_kind, (), 0, 3)
+    return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected])[kind]
 
 
 def training_episodes(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES) -> Scenario:
@@ -66,32 +66,31 @@ def coordinate_search(
     score: Callable[[dict[str, Any]], float],
     grid: Mapping[str, Sequence[Any]],
     start: Mapping[str, Any],
+    most: int,
     report: Report = lambda text: None,
-) -> tuple[dict[str, Any], float, int]:
-    """The best settings found by changing one at a time to its neighbours on the grid, until no change helps.
+) -> tuple[dict[str, Any], int]:
+    """The best settings found by moving one at a time along its grid, until no move helps or `most` were tried.
 
     Returns:
-        Settings, their score, and the number of evaluations.
+        Settings, and the number of evaluations.
     """
     known: dict[tuple[Any, ...], float] = {}
 
     def value(settings: dict[str, Any]) -> float:
         key = tuple(settings.values())
-        if key not in known:
+        if key not in known and len(known) < most:
             known[key] = score(settings)
-            report(f"{len(known)} tried")
-        return known[key]
+            report(f"{len(known)} settings tried")
+        return known.get(key, -np.inf)
 
-    best = dict(start)
-    while True:
+    best, before = dict(start), -np.inf
+    while value(best) > before:
         before = value(best)
         for name, values in grid.items():
-            while True:
-                i = list(values).index(best[name])
-                around = [{**best, name: values[j]} for j in (i - 1, i + 1) if 0 <= j < len(values)]
-                better = max(around, key=value)
-                if value(better) <= value(best):
-                    break
-                best = better
-        if value(best) <= before:
-            return best, before, len(known)
+            for direction in (1, -1):
+                ahead = list(values)[list(values).index(best[name]) :: direction][1:]
+                for candidate in ({**best, name: other} for other in ahead):
+                    if value(candidate) <= value(best):
+                        break
+                    best = candidate
+    return best, len(known)

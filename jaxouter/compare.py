@@ -1,0 +1,234 @@
+"""`python -m jaxouter.compare`: every policy beside its rivals and beside the limit, on every scenario."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from jaxouter import cli, plants
+from jaxouter.evaluation import board, comparison, report, scenarios, statistics, sweeps
+from jaxouter.evaluation.board import Contender, Done, Job
+from jaxouter.evaluation.rivals import CLAIRVOYANT, NAMES, RIVALS
+from jaxouter.training.run import open_run, surroundings, write_json
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare policies with their rivals, with the limit and with a lower bound, and write a report.
+
+    Rivals (none, static, pi, mpc, deepc, inverse) are identified and tuned on the training distribution of the plant,
+    through r~ and y alone; `oracle` is the limit for policies without preview, `clairvoyant` a lower bound with
+    preview. What concerns them is computed once and kept in the cache folder; the first time takes minutes.
+    """
+
+    plant: Annotated[str | None, tyro.conf.Positional] = None
+    """Plant; default: that of the runs, or pitch."""
+    run: tuple[Path, ...] = ()
+    """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
+    policy: tuple[str, ...] = ()
+    """Names of those to compare with (default: all; none always), and FILE.py:CLASS for policies of your own."""
+    scenario: tuple[str, ...] = ()
+    """Scenarios, such as pitch/paper; default: all of the plant; see --list."""
+    sweep: tuple[str, ...] | None = None
+    """Sweeps, such as pitch/gain; default: all of the plant; without a name: no sweep."""
+    family_seed: int = scenarios.FAMILY_SEED
+    """Seed of the reference families."""
+    out: Path | None = None
+    """Folder for the results, which must not exist; default: runs/compare-PLANT."""
+    list: bool = False
+    """Print plants, presets, scenarios, sweeps and policies, and end."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the options mean."""
+
+    plant: str
+    contenders: tuple[Contender, ...]
+    scenarios: tuple[str, ...]
+    sweeps: tuple[str, ...]
+    family_seed: int
+    out: Path
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    begun = time.perf_counter()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with cli.user_errors():
+        options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
+        if options.list:
+            return cli.print_lists()
+        plan = check(options)
+        cli.use_compilation_cache()
+        plan.out.mkdir(parents=True)
+        done = work(plan)
+    content = assemble(plan, done)
+    content |= {
+        "seconds": time.perf_counter() - begun,
+        "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
+    }
+    page = write(plan, content, done)
+    show(content)
+    print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
+
+
+def check(options: Options) -> Plan:
+    """Everything that can be wrong and found without work.
+
+    Raises:
+        ValueError: the options do not fit together, or name what does not exist.
+    """
+    runs = [open_run(path) for path in options.run]
+    plant = options.plant or (runs[0][0].config.plant if runs else "pitch")
+    plants.resolve(plant)
+    for path, (run, _, _) in zip(options.run, runs, strict=True):
+        if run.config.plant != plant:
+            raise ValueError(f"{path} is a run on {run.config.plant}; the comparison is on {plant}")
+    for name in options.scenario:
+        scenarios.builder(name)
+    for name in options.sweep or ():
+        sweeps.builder(name)
+    foreign = [name for name in (*options.scenario, *(options.sweep or ())) if name.split("/")[0] != plant]
+    if foreign:
+        raise ValueError(f"the comparison is on {plant}; {foreign[0]} is another plant's")
+    if not 0 <= options.family_seed < 2**32:
+        raise ValueError(f"--family-seed is {options.family_seed}; it must lie in [0, 2^32)")
+    contenders = [
+        Contender("learned", "learned", str(run.path), seed)
+        for run, median, chosen in runs
+        for seed in (chosen if len(chosen) == 1 else sorted(chosen, key=lambda seed: seed != median))
+    ]
+    return Plan(
+        plant,
+        (*contenders, *named(options.policy)),
+        options.scenario or tuple(scenarios.catalogue(plant)),
+        tuple(sweeps.catalogue(plant)) if options.sweep is None else options.sweep,
+        options.family_seed,
+        folder(options.out, plant),
+    )
+
+
+def named(names: Sequence[str]) -> list[Contender]:
+    """The policies with these names, and a user's own; where no name is given, all.
+
+    Raises:
+        ValueError: there is no such policy or file.
+    """
+    own, built_in = [], []
+    for name in dict.fromkeys(names):
+        file, colon, attribute = name.rpartition(":")
+        if colon and file.endswith(".py"):
+            board.load_class(Path(file), attribute)
+            own.append(Contender(f"{Path(file).name}:{attribute}", "user", file, None, attribute))
+        elif name in NAMES:
+            built_in.append(name)
+        else:
+            raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
+    chosen = [name for name in NAMES if name == "none" or not built_in or name in built_in]
+    return own + [Contender(name, "preview" if name == CLAIRVOYANT else RIVALS[name].kind) for name in chosen]
+
+
+def folder(out: Path | None, plant: str) -> Path:
+    """The folder to write to; by default runs/compare-PLANT, with -2, -3, ... where that exists.
+
+    Raises:
+        ValueError: `out` exists.
+    """
+    if out is not None:
+        if out.exists():
+            raise ValueError(f"{out} exists; choose another --out")
+        return out
+    base = Path("runs") / f"compare-{plant}"
+    return next(p for p in (base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))) if not p.exists())
+
+
+def work(plan: Plan) -> list[Done]:
+    """All jobs done, in their order, with progress."""
+    phases = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
+    done: dict[Job, Done] = {}
+    with cli.JobProgress(sum(map(len, phases))) as progress:
+        for jobs in phases:
+            for finished in board.spread(jobs, cli.use_compilation_cache, progress.say):
+                done[finished.job] = finished
+                progress.advance(f"{finished.job}: {finished.seconds:.0f} s")
+    return [done[job] for jobs in phases for job in jobs]
+
+
+def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
+    """The content of comparison.json."""
+    known = board.policies(plan.contenders, done)
+    rows = statistics.ranks(board.rows(done), known)
+    plant, _ = plants.make(plan.plant)
+    swept = board.swept(done, plan.sweeps)
+    for sweep in swept.values():
+        sweep["best_rival"] = statistics.best_rival(sweep, known)
+    return {
+        "format": FORMAT,
+        "plant": plan.plant,
+        "y_unit": plant.y_unit,
+        "time_unit": plant.time_unit,
+        "family_seed": plan.family_seed,
+        "date": datetime.date.today().isoformat(),
+        "machine": surroundings(),
+        "policies": known,
+        "rows": rows,
+        "statistics": statistics.summarise(rows, known),
+        "sweeps": swept,
+        "certificate": board.certificates(done),
+    }
+
+
+def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
+    """comparison.json, comparison.csv, figures and the report; returns the report's path."""
+    rows = content["rows"]
+    write_json(plan.out / "comparison.json", content)
+    with (plan.out / "comparison.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+        table.writeheader()
+        table.writerows(rows)
+    figures, responses = comparison.draw(plan.out / "figures", content), {}
+    lines = statistics.lines(rows, content["policies"])
+    label = {(line.policy, line.run): line.label for line in lines}
+    for name in plan.scenarios:
+        traces = {
+            label[c.name, c.path if c.kind == "learned" else None]: t
+            for c, t in board.first_episodes(done, name).items()
+        }
+        traces = {line.label: traces[line.label] for line in lines}
+        path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
+        scenario = scenarios.get(name, family_seed=plan.family_seed)
+        responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
+    return report.write(plan.out / "report.html", content, figures, responses)
+
+
+def show(content: dict[str, Any]) -> None:
+    """Print MAE and ratio to the limit, the best of each scenario in bold."""
+    lines = statistics.lines(content["rows"], content["policies"])
+    table = []
+    for name in statistics.scenarios(content["rows"]):
+        cells = [name]
+        for line in lines:
+            mae, ratio = line.median(name, "mae"), line.median(name, "ratio_to_limit")
+            best = any(row["best"] for row in line.rows.get(name, []))
+            text = "diverged" if mae is None else cli.number(mae) + ("" if ratio is None else f" ({ratio:.2f})")
+            mark = "" if mae is None or line.within_limits(name) else "!"
+            cells.append(f"[bold]{text}[/bold]" if best else text + mark)
+        table.append(cells)
+    title = f"MAE in {content['y_unit']} (ratio to the limit); bold: best without the model; !: outside the limits"
+    cli.table(title, ["scenario", *(line.label for line in lines)], table)
+
+
+if __name__ == "__main__":
+    cli.run(main)

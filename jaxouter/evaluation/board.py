@@ -1,0 +1,307 @@
+"""The comparison: every policy on every scenario, every sweep and every certificate, spread over the cores.
+
+Work is cut into jobs, plain picklable values, that `run` executes in this or another process. What depends on nothing
+but code and configuration, all that concerns the built-in rivals, is kept in the cache.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxouter.evaluation import cache, certificate, scenarios, sweeps
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS, Kind, identified
+from jaxouter.evaluation.rivals.clairvoyant import Replay, plan
+from jaxouter.evaluation.rivals.tuning import Report
+from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.loop.policy import Policy
+from jaxouter.plants import make
+from jaxouter.training.run import Run
+
+WITHIN = 1e-3  # share of the steps that may lie outside the limits
+SET_POINTS = 5  # of the certificate, over the range of evaluation
+LEARNED_NOTE = "The learned outer loop, without exploration."
+PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
+
+
+class Contender(NamedTuple):
+    """A policy of the comparison and where it comes from."""
+
+    name: str
+    kind: Kind
+    path: str | None = None  # run folder, or the user's file
+    seed: int | None = None  # of a run
+    attribute: str = ""  # class in the user's file
+
+
+class Job(NamedTuple):
+    """One piece of work; `what` is identify, meet, sweep or certify."""
+
+    what: str
+    contender: Contender
+    plant: str
+    on: str = ""  # scenario or sweep
+    family_seed: int = scenarios.FAMILY_SEED
+
+    def __str__(self) -> str:
+        seed = "" if self.contender.seed is None else f" seed {self.contender.seed}"
+        return f"{self.what} {self.contender.name}{seed} {self.on}".strip()
+
+
+class Done(NamedTuple):
+    """A job, what it gave, and how long it took."""
+
+    job: Job
+    found: Tuned
+    seconds: float
+
+
+def load_class(path: Path, attribute: str) -> Any:
+    """The class in a user's file.
+
+    Raises:
+        ValueError: there is no such file or class, or the file can't be imported.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} is not a file; a policy of your own is named FILE.py:CLASS")
+    spec = importlib.util.spec_from_file_location(f"policy_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file; a policy of your own is named FILE.py:CLASS")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
+    if not hasattr(module, attribute):
+        raise ValueError(f"{path} has no class {attribute!r}")
+    return getattr(module, attribute)
+
+
+@lru_cache(maxsize=64)
+def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
+    """The policy and its parameters.
+
+    Raises:
+        ValueError: a run has no checkpoint, or a user's policy can't be made.
+    """
+    plant, _ = make(plant_name)
+    if contender.kind == "learned":
+        run = Run.open(Path(contender.path or ""))
+        state, _ = run.load(contender.seed or 0)
+        return run.trainer[0].policy, run.trainer[0].policy_params(state)
+    if contender.kind == "user":
+        policy = load_class(Path(contender.path or ""), contender.attribute)(plant)
+        return policy, getattr(policy, "params", ())
+    return RIVALS[contender.name].build(plant, identified(contender.name, plant_name))
+
+
+def meet(contender: Contender, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """Figures of merit on a scenario, and the traces of its first episode."""
+    scenario = scenarios.get(on, family_seed=family_seed)
+    if contender.kind == "preview":
+        best = plan(scenario)
+        traces = rollout(Replay(), best.r_tilde, scenario, per_episode=True)
+    else:
+        traces = rollout(*load(contender, plant_name), scenario)
+    arrays = {name: getattr(traces, name)[:1] for name in ("y0", "r", "y", "r_tilde")}
+    return Tuned(figures_of_merit(traces, scenario) | {"stable_alone": scenario.stable_alone}, arrays, 0)
+
+
+def sweep(contender: Contender, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """MAE over the grid of a sweep, a coarser one for policies that run on the host."""
+    del family_seed
+    policy, params = load(contender, plant_name)
+    swept = sweeps.get(on, coarse=policy.host)
+    found = swept.mae(rollout(policy, params, swept.scenario))
+    mae = np.where(np.isfinite(found), found.astype(object), np.array(None)).tolist()
+    return Tuned({"values": [list(axis.values) for axis in swept.axes], "mae": mae}, {}, 0)
+
+
+def certify(contender: Contender, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """Local stability at set-points over the range of evaluation, on the plant of a scenario."""
+    scenario = scenarios.get(on, 1, family_seed)
+    params = jax.tree.map(lambda leaf: leaf[0], scenario.params)
+    points = np.linspace(*scenario.plant.evaluation_range, SET_POINTS)
+    rows = certificate.certify(*load(contender, plant_name), scenario.plant, params, points.tolist())
+    return Tuned({"rows": [row._asdict() for row in rows]}, {}, 0)
+
+
+def run(job: Job, report: Report = lambda text: None) -> Done:
+    """Do one job.
+
+    Raises:
+        ValueError: it can't be done, or a user's policy failed at it.
+    """
+    begin, c = time.perf_counter(), job.contender
+    work = {"meet": meet, "sweep": sweep, "certify": certify}.get(job.what)
+    report("begun")
+    if work is None:
+        found = identified(c.name, job.plant, report)
+    elif c.kind == "learned":
+        found = work(c, job.plant, job.on, job.family_seed)
+    elif c.kind == "user":
+        try:
+            found = work(c, job.plant, job.on, job.family_seed)
+        except Exception as error:
+            raise ValueError(f"{c.name} failed on {job.on}: {type(error).__name__}: {error}") from error
+    else:
+        key = {"on": job.on, "family_seed": job.family_seed}
+        make_it = partial(work, c, job.plant, job.on, job.family_seed)
+        found = cache.cached(f"{job.plant}-{c.name}-{job.what}", key, make_it)
+    return Done(job, found, time.perf_counter() - begin)
+
+
+def jobs(
+    plant: str, contenders: Sequence[Contender], met: Sequence[str], swept: Sequence[str], family_seed: int
+) -> tuple[list[Job], list[Job]]:
+    """Jobs of identification, and those that follow; the long ones first."""
+    first = [Job("identify", c, plant) for c in reversed(contenders) if c.name in RIVALS and c.kind != "learned"]
+    acting = [c for c in contenders if c.kind != "preview"]
+    one_seed = {(c.name, c.path): c for c in reversed(acting)}  # sweeps and certificates: the first seed of each run
+    rest = [Job("meet", c, plant, on, family_seed) for on in met for c in contenders]
+    rest += [Job("sweep", c, plant, on) for on in swept for c in one_seed.values()]
+    rest += [
+        Job("certify", c, plant, on, family_seed)
+        for on in scenarios.stability_scenarios(plant)
+        if on in met
+        for c in one_seed.values()
+    ]
+    return first, rest
+
+
+class _Worker:
+    """What a process of the pool knows: where to say how far it is."""
+
+    messages: Any = None
+
+    @classmethod
+    def begin(cls, messages: Any, initialise: Callable[[], None]) -> None:
+        cls.messages = messages
+        initialise()
+
+    @classmethod
+    def run(cls, job: Job) -> Done:
+        return run(job, lambda text: cls.messages.put(f"{job}: {text}"))
+
+
+def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) -> Iterator[Done]:
+    """The jobs as they get done: on a CPU in a process a core, on an accelerator one after the other.
+
+    Args:
+        work: jobs that do not need each other.
+        initialise: called first in each process; picklable.
+        report: told now and then how far they are.
+    """
+    cores = os.cpu_count() or 1
+    if jax.default_backend() != "cpu" or cores == 1 or len(work) == 1:
+        for job in work:
+            yield run(job, lambda text, job=job: report(f"{job}: {text}"))
+        return
+    context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
+    messages = context.SimpleQueue()
+    with ProcessPoolExecutor(min(cores, len(work)), context, _Worker.begin, (messages, initialise)) as pool:
+        waiting = {pool.submit(_Worker.run, job) for job in work}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+                while not messages.empty():
+                    report(messages.get())
+                for future in done:
+                    yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def policies(contenders: Sequence[Contender], done: Sequence[Done]) -> dict[str, dict[str, Any]]:
+    """What each policy is, and what its identification and tuning took."""
+    tuned = {d.job.contender.name: d for d in done if d.job.what == "identify"}
+    found: dict[str, dict[str, Any]] = {}
+    for c in contenders:
+        known = {"kind": c.kind, "steps": None, "seconds": None, "settings": {}, "note": ""}
+        if c.kind == "learned":
+            config = Run.open(Path(c.path or "")).config
+            known |= {"steps": config.steps, "settings": {"preset": config.preset}, "note": LEARNED_NOTE}
+        elif c.kind == "preview":
+            known |= {"note": PREVIEW_NOTE}
+        elif c.kind == "user":
+            known |= {"note": f"{c.attribute} of {c.path}"}
+        else:
+            identification = tuned[c.name]
+            known |= {"steps": identification.found.steps, "seconds": identification.seconds}
+            known |= {"settings": identification.found.settings, "note": RIVALS[c.name].note}
+        found[c.name] = known
+    return found
+
+
+def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
+    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone."""
+    met = [d for d in done if d.job.what == "meet"]
+    reference = {(d.job.contender.name, d.job.on): d.found.settings["mae"] for d in met}
+
+    def over(mae: float | None, name: str, on: str) -> float | None:
+        against = reference.get((name, on))
+        return None if mae is None or not against else mae / against
+
+    found = []
+    for d in met:
+        figures, c, on = dict(d.found.settings), d.job.contender, d.job.on
+        stable, outside = figures.pop("stable_alone"), figures["violation_time"]
+        mae, alone = figures["mae"], over(figures["mae"], "none", on)
+        figures["improvement"] = 100.0 * (1.0 - alone) if alone is not None and stable else None
+        found.append(
+            {
+                "policy": c.name,
+                "run": c.path if c.kind == "learned" else None,
+                "seed": c.seed,
+                "scenario": on,
+                "mae": mae,
+            }
+            | {"ratio_to_limit": over(mae, "oracle", on), "ratio_to_bound": over(mae, CLAIRVOYANT, on)}
+            | {"within_limits": mae is not None and (outside is None or outside <= WITHIN)}
+            | figures
+        )
+    return found
+
+
+def first_episodes(done: Sequence[Done], on: str) -> dict[Contender, Traces]:
+    """Traces of the first episode of a scenario under each policy; of a run its first seed."""
+    nothing = dict(reward=None, each_outside=None, each_excess=None, members=None)
+    found: dict[tuple[str, str | None], tuple[Contender, Traces]] = {}
+    for d in done:
+        if d.job.what == "meet" and d.job.on == on:
+            c = d.job.contender
+            found.setdefault((c.name, c.path), (c, Traces(**d.found.arrays, **nothing)))
+    return dict(found.values())
+
+
+def swept(done: Sequence[Done], names: Sequence[str]) -> dict[str, Any]:
+    """The sweeps as JSON values."""
+    found: dict[str, Any] = {}
+    for name in names:
+        axes = [axis.__dict__ | {"values": list(axis.values)} for axis in sweeps.get(name).axes]
+        own = [d for d in done if d.job.what == "sweep" and d.job.on == name]
+        found[name] = {"axes": axes, "policies": {d.job.contender.name: d.found.settings for d in reversed(own)}}
+    return found
+
+
+def certificates(done: Sequence[Done]) -> list[Mapping[str, Any]]:
+    """The certificates as JSON values."""
+    certified = [d for d in done if d.job.what == "certify"]
+    return [
+        {"policy": d.job.contender.name, "scenario": d.job.on, **row}
+        for d in certified
+        for row in d.found.settings["rows"]
+    ]
