@@ -215,19 +215,8 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
 
 def show(content: dict[str, Any]) -> None:
     """Print MAE and ratio to the limit, the best of each scenario in bold."""
-    lines = statistics.lines(content["rows"], content["policies"])
-    table = []
-    for name in statistics.scenarios(content["rows"]):
-        cells = [name]
-        for line in lines:
-            mae, ratio = line.median(name, "mae"), line.median(name, "ratio_to_limit")
-            best = any(row["best"] for row in line.rows.get(name, []))
-            text = "diverged" if mae is None else cli.number(mae) + ("" if ratio is None else f" ({ratio:.2f})")
-            mark = "" if mae is None or line.within_limits(name) else "!"
-            cells.append(f"[bold]{text}[/bold]" if best else text + mark)
-        table.append(cells)
-    title = f"MAE in {content['y_unit']} (ratio to the limit); bold: best without the model; !: outside the limits"
-    cli.table(title, ["scenario", *(line.label for line in lines)], table)
+    columns, rows = statistics.table(content["rows"], content["policies"], "[bold]{}[/bold]")
+    cli.table(f"MAE in {content['y_unit']} (ratio to the limit); bold: best; !: outside the limits", columns, rows)
 
 
 if __name__ == "__main__":

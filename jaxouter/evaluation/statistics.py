@@ -215,6 +215,29 @@ def _improvements(every: Sequence[Line]) -> dict[str, Any]:
     return found
 
 
+def table(rows: Rows, policies: Policies, best: str) -> tuple[list[str], list[list[str]]]:
+    """MAE and ratio to the limit as text, a line a scenario and a column a policy, medians over seeds.
+
+    Args:
+        rows: with their ranks.
+        policies: as in comparison.json.
+        best: format of the best of each scenario, such as `**{}**`; one outside the limits has a `!`.
+
+    Returns:
+        Titles of the columns, and the lines.
+    """
+    every, body = lines(rows, policies), []
+    for name in scenarios(rows):
+        cells = [name]
+        for line in every:
+            mae, ratio = line.median(name, "mae"), line.median(name, "ratio_to_limit")
+            text = "diverged" if mae is None else f"{mae:.3g}" + ("" if ratio is None else f" ({ratio:.2f})")
+            text += "" if mae is None or line.within_limits(name) else "!"
+            cells.append(best.format(text) if any(row["best"] for row in line.rows.get(name, [])) else text)
+        body.append(cells)
+    return ["scenario", *(line.label for line in every)], body
+
+
 def on_grid(swept: Mapping[str, Any], values: Sequence[Sequence[float]]) -> np.ndarray:
     """MAE of one policy of a sweep at other values of the axes; nan where it diverged or did not run.
 

@@ -33,8 +33,8 @@ from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
 BATCH = 64  # episodes a gradient step and seed
-FIRST_STAGE = 500  # gradient steps; each stage then doubles their number
-STAGES = 4
+FIRST_STAGE = 1000  # gradient steps; each stage then doubles their number
+STAGES = 3
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
 RATE, CLIP = 3e-3, 1.0
@@ -165,7 +165,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     test = jax.jit(jax.vmap(folded, (0, None)))
     values, before, reached, gradient_steps = np.zeros(SEEDS), -np.inf, -np.inf, 0
     for stage in range(STAGES):
-        length = FIRST_STAGE * 2 ** max(0, stage - 1)  # 500, 500, 1000, 2000: each doubles what there is
+        length = FIRST_STAGE * 2 ** max(0, stage - 1)  # 1000, 1000, 2000: each doubles what there is
         rates = np.asarray(optax.cosine_decay_schedule(RATE, length)(np.arange(length)))
         carry = actors, jax.vmap(ADAM.init)(actors)
         for i in range(0, length, CHUNK):

@@ -57,7 +57,8 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     """Gains with the greatest return on training episodes, by COBYQA (scipy), within `budget` environment steps.
 
     The search runs over asinh of kp G and of ki G times the episode, G the identified DC gain, so that it reaches far
-    and is fine near zero; it starts from a gentle controller.
+    and is fine near zero; it starts from a gentle controller. The integral acts with the right sign and never quite
+    vanishes: a wrong one can pay within an episode, but drifts away after it.
     """
     key_static, key_episodes = jax.random.split(key)
     _, prior = static(plant, params, key_static)
@@ -76,7 +77,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         report(f"{len(best)} tried")
         return -best[-1][0] if np.isfinite(best[-1][0]) else 1e6
 
-    bounds = [(-2.0, 5.0), (-2.0, 6.0)]
+    bounds = [(0.0, 5.0), (0.01, 6.0)]
     options = {"maxfev": (budget - spent) // each, "initial_tr_radius": 0.5, "final_tr_radius": 1e-3}
     scipy.optimize.minimize(loss, [0.5, 0.2], method="COBYQA", bounds=bounds, options=options)
     _, found = max(best, key=lambda tried: tried[0])
