@@ -7,9 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxouter.loop import identify
+from jaxouter.loop.identify import ARX, Record
 from jaxouter.plants import make
 from tests import lag
 
@@ -61,3 +63,76 @@ def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyP
 def test_plant_that_does_not_answer_is_refused(K: float) -> None:
     with pytest.raises(ValueError, match=r"DC gain of lag.*no r~ in \(-4.0, 4.0\)"):
         identify.dc_gain(*lag.make(K=K), KEY)
+
+
+# The lag with K = 0.5, T = 0.3 s and a dead time of 2.5 steps of 0.1 s: two steps pass, then r~ jumps half way.
+HALF = np.exp(-0.05 / 0.3)
+A, B = [HALF**2, 0.0], [0.5 * (1 - HALF), 0.5 * HALF * (1 - HALF)]
+TRUE = ARX(np.array(A), np.array(B), 0.0, 2, 0.0)
+
+
+@pytest.fixture(scope="module")
+def data() -> Record:
+    return identify.record(*lag.make(), KEY, 40)
+
+
+def test_record_is_the_response_to_levels_held_from_long_to_briefly(data: Record) -> None:
+    assert data.r_tilde.shape == (40, 50)
+    assert data.y.shape == (40, 51)
+    assert data.r_tilde.dtype == data.y.dtype == np.float64
+    assert -4.0 <= data.r_tilde.min() < -3.9
+    assert 3.9 < data.r_tilde.max() <= 4.0
+    changes = np.count_nonzero(np.diff(data.r_tilde), axis=1)
+    assert changes.min() <= 4
+    assert 15 <= changes.max() <= 35
+    assert np.all(np.abs(data.y[:, 0]) <= 0.5)
+    assert np.ptp(data.y[:, 0]) > 0.9
+    # From y_0 with a line full of zeros: r~_k moves y_(k+3) first, by B[0], then the rest of its step.
+    expected = data.y[:, :1]
+    for k in range(50):
+        late = [data.r_tilde[:, [k - i]] if k >= i else np.zeros((40, 1)) for i in (2, 3)]
+        expected = np.hstack([expected, A[0] * expected[:, -1:] + B[0] * late[0] + B[1] * late[1]])
+    np.testing.assert_allclose(data.y, expected, atol=1e-5)
+
+
+def test_arx_model_of_a_lag_is_exact_without_noise(data: Record) -> None:
+    found = identify.fit_arx(data, 2, 2)
+    np.testing.assert_allclose(found.a, A, atol=1e-6)
+    np.testing.assert_allclose(found.b, B, atol=1e-6)
+    assert found.c == pytest.approx(0.0, abs=1e-6)
+    assert found.dead == 2
+    assert found.sigma < 1e-6
+
+
+def test_arx_model_has_the_offset_and_the_size_of_the_noise(data: Record) -> None:
+    """With white e in the equation itself, for which least squares is consistent."""
+    rng = np.random.default_rng(0)
+    y = np.zeros_like(data.y)
+    for k in range(3, 50):
+        e = rng.normal(0.0, 0.05, len(y))
+        y[:, k + 1] = A[0] * y[:, k] + B[0] * data.r_tilde[:, k - 2] + B[1] * data.r_tilde[:, k - 3] + 0.2 + e
+    found = identify.fit_arx(Record(data.r_tilde, y), 2, 2)
+    np.testing.assert_allclose(found.a, A, atol=0.05)
+    np.testing.assert_allclose(found.b, B, atol=0.005)
+    assert found.c == pytest.approx(0.2, abs=0.05)
+    assert found.sigma == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize("dead", [0, 1, 3])
+def test_wrong_dead_time_fits_worse(dead: int, data: Record) -> None:
+    assert identify.fit_arx(data, 2, dead).sigma > 1e-2
+
+
+@pytest.mark.parametrize("horizon", [1, 10, 47])
+def test_true_model_predicts_without_error(horizon: int, data: Record) -> None:
+    assert identify.predict(TRUE, data, horizon).shape[::2] == (40, horizon)
+    assert identify.prediction_error(TRUE, data, horizon) < 1e-5
+
+
+def test_prediction_error_is_that_of_the_free_run_by_hand() -> None:
+    """Y doubles in truth; the model says y_(k+1) = y_k + r~_k: of 2 and 4 it predicts 1 + 1 and 2 + 1."""
+    data = Record(np.ones((1, 2)), np.array([[1.0, 2.0, 4.0]]))
+    model = ARX(np.ones(1), np.ones(1), 0.0, 0, 0.0)
+    np.testing.assert_allclose(identify.predict(model, data, 2), [[[2.0, 3.0]]])
+    assert identify.prediction_error(model, data, 2) == pytest.approx(np.sqrt((0.0**2 + 1.0**2) / 2))
+    np.testing.assert_allclose(identify.predict(model, data, 1), [[[2.0], [3.0]]])

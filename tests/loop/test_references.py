@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint
+from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, telegraph
 
 KEY = jax.random.key(0)
 STEPS = 200
@@ -103,6 +103,35 @@ def test_days_are_sixteen_warm_and_eight_cool_hours() -> None:
         assert all(length == (16 if value == warm else 8) for value, length in inner)
         beginnings.add((r[0] == warm, runs(r)[0][1]))
     assert len(beginnings) > 12, "days begin at a random hour"
+
+
+def telegraphs(redraw: float) -> np.ndarray:
+    """(MEMBERS, STEPS)."""
+    draw = jax.jit(jax.vmap(lambda key: telegraph(key, STEPS, LOW, HIGH, redraw)))
+    return np.asarray(draw(jax.random.split(KEY, MEMBERS)))
+
+
+def test_telegraph_that_is_never_redrawn_is_constant() -> None:
+    r = telegraphs(0.0)
+    np.testing.assert_array_equal(np.ptp(r, axis=1), 0.0)
+    assert len(np.unique(r[:, 0])) == MEMBERS
+
+
+def test_telegraph_redrawn_with_certainty_changes_at_each_step() -> None:
+    assert np.all(np.diff(telegraphs(1.0)) != 0.0)
+
+
+@pytest.mark.parametrize("redraw", [0.02, 0.2])
+def test_telegraph_holds_levels_of_the_range_and_changes_as_often_as_asked(redraw: float) -> None:
+    r = telegraphs(redraw)
+    chex.assert_type(r, jnp.float32)
+    assert LOW <= r.min() < LOW + 0.5
+    assert HIGH - 0.5 < r.max() <= HIGH
+    n = MEMBERS * (STEPS - 1)
+    assert abs(np.count_nonzero(np.diff(r)) - n * redraw) < 5 * np.sqrt(n * redraw * (1 - redraw))
+    levels = np.array([level for one in r for level, _ in runs(one)])
+    assert len(np.unique(levels)) > 0.99 * len(levels), "each level is drawn anew"
+    assert levels.mean() == pytest.approx(MIDDLE, abs=5 * HALF / np.sqrt(3 * len(levels)))
 
 
 @partial(jax.jit, static_argnums=0)

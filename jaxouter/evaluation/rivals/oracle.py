@@ -39,7 +39,7 @@ ENOUGH = 0.01  # relative gain of the return by doubling, below which training e
 CHUNK = 50  # gradient steps between two reports
 RATE, CLIP = 3e-3, 1.0
 VALIDATION = 512  # training episodes on which the best seed is chosen
-FLOOR = 1e-3  # of the standard deviations by which the observation is whitened
+FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 
 
 class Whitening(NamedTuple):
@@ -59,8 +59,10 @@ class Teacher:
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward a step, and the policy's carries (T, ...) with r and y (T,)."""
         plant, steps = self.plant, self.plant.episode_steps
-        key_draw, key_start, key_r, key_run = jax.random.split(key, 4)
+        key_draw, key_start, key_r, key_run, key_quiet = jax.random.split(key, 5)
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
+        quiet = jax.random.bernoulli(key_quiet)
+        plant_params = jax.tree.map(partial(jnp.where, quiet), plant.noise_free(plant_params), plant_params)
         price = rewards.params(plant)
         r = set_points(key_r, plant, steps)
         state = plant.training_start(key_start, plant_params)
