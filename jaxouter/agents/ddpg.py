@@ -126,7 +126,7 @@ def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.
     return reward + discount * jnp.min(next_q)
 
 
-def _descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
+def descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
     """Parameters and optimiser state after one step."""
     with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
         step, state = optimiser.update(gradient, state, params)
@@ -228,7 +228,7 @@ class DDPG:
             return jnp.mean(jnp.sum((target[:, None] - q) ** 2, -1)), jnp.mean(q)
 
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
-        critics, critic_optimiser = _descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
+        critics, critic_optimiser = descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
         def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array]]:
@@ -240,7 +240,7 @@ class DDPG:
                 return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
 
             (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
-            actor, optimiser = _descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
+            actor, optimiser = descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
             state = state._replace(
                 actor=actor,
                 actor_optimiser=optimiser,

@@ -39,7 +39,7 @@ class Settings(NamedTuple):
     past: int  # control steps that must agree
     horizon: int  # control steps
     move_weight: float  # of squared moves of r~, in squared errors that their DC effect would be
-    g_weight: float  # w_g, in mean squares of y
+    g_weight: float  # w_g over the number of windows, in mean squares of y
     margin: float  # kept from the limits, in standard deviations of the one-step prediction
 
 
@@ -77,8 +77,8 @@ class DeePC:
 
 def windows(data: Record, past: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     """Columns of the record: what is given (past moves, past y, future moves) and future y; rows are times."""
-    moves = np.diff(data.r_tilde, axis=1, prepend=data.r_tilde[:, :1])
-    now = np.arange(past, data.r_tilde.shape[1] - horizon + 1)
+    moves = np.diff(data.r_tilde, axis=1, prepend=np.nan)
+    now = np.arange(past + 1, data.r_tilde.shape[1] - horizon + 1)  # the move at the start is not known
 
     def rows(signal: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         return signal[:, now[:, None] + offsets].reshape(-1, len(offsets)).T

@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from jaxouter.agents.ddpg import descend
 from jaxouter.agents.networks import Actor
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.rivals.tuning import EPISODES, Report, score, training_episodes
@@ -90,8 +91,7 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
         episode = jax.random.randint(key_episode, (BATCH,), 0, episodes)
         t = H + jnp.floor(jax.random.uniform(key_t, (BATCH,)) * (steps + 1 - H - h)).astype(episode.dtype)
         gradient = jax.grad(lambda p: jnp.mean(jax.vmap(error, (None, 0, 0))(p, episode, t)))(params)
-        step, state = adam.update(gradient, state)
-        return (optax.apply_updates(params, step), state), None
+        return descend(adam, gradient, state, params), None
 
     return jax.lax.scan(update, (params, adam.init(params)), jax.random.split(key_batches, UPDATES))[0][0]
 

@@ -91,9 +91,8 @@ class Teacher:
             return jax.vmap(lambda carry, r, y: self.policy.observer.observe(carry, r, y)[1])(*seen)
 
         obs = jax.vmap(observed)(jax.random.split(key, BATCH)).reshape(-1, self.policy.observer.size)
-        mean = obs.mean(0)
-        variance, axes = jnp.linalg.eigh((obs - mean).T @ (obs - mean) / len(obs))
-        return Whitening(mean, (axes / jnp.sqrt(jnp.maximum(variance, 0.0) + FLOOR**2)) @ axes.T)
+        variance, axes = jnp.linalg.eigh(jnp.cov(obs, rowvar=False))
+        return Whitening(obs.mean(0), (axes / jnp.sqrt(jnp.maximum(variance, 0.0) + FLOOR**2)[None]) @ axes.T)
 
     @partial(jax.jit, static_argnums=0)
     def returns(self, actors: Any, prior: AffineParams, plant_params: Any, key: chex.PRNGKey) -> jax.Array:
@@ -124,7 +123,8 @@ class Teacher:
             return -jnp.mean(jax.vmap(lambda key: self.episode(self.policy, params, plant_params, key)[0])(keys))
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
-            step, state = ADAM.update(jax.grad(loss)(actor, keys), state)
+            with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
+                step, state = ADAM.update(jax.grad(loss)(actor, keys), state)
             return jax.tree.map(lambda p, s: p - rate * s, actor, step), state
 
         def step(carry: Any, x: Any) -> tuple[Any, None]:
@@ -141,7 +141,7 @@ ADAM = optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam())
 def folded(actor: Any, white: Whitening) -> Any:
     """The actor in terms of the observation, from one whose first layer takes the whitened one."""
     layers = actor["params"]
-    first = next(iter(sorted(layers)))
+    first = min(layers)
     kernel = white.matrix @ layers[first]["kernel"]
     bias = layers[first]["bias"] - white.mean @ kernel
     return {"params": layers | {first: {"kernel": kernel, "bias": bias}}}
@@ -164,11 +164,12 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     _, prior = static(plant, params, key_static)
     white = school.whitening(prior, params, key_white)
     actors = jax.vmap(lambda key: school.policy.learner.init(key).actor)(jax.random.split(key_seeds, SEEDS))
-    test = jax.jit(jax.vmap(folded, (0, None)))
-    values, before, reached, gradient_steps = np.zeros(SEEDS), -np.inf, -np.inf, 0
+    fold = jax.jit(jax.vmap(folded, (0, None)))
+    stages: list[np.ndarray] = []  # returns (seeds,) after each
+    best, gradient_steps = actors, 0
     for stage in range(STAGES):
         length = FIRST_STAGE * 2 ** max(0, stage - 1)  # 1000, 1000, 2000: each doubles what there is
-        rates = np.asarray(optax.cosine_decay_schedule(RATE, length)(np.arange(length)))
+        rates = RATE * (1.0 + np.cos(np.pi * np.arange(length) / length)) / 2
         carry = actors, jax.vmap(ADAM.init)(actors)
         for i in range(0, length, CHUNK):
             key_run, key_chunk = jax.random.split(key_run)
@@ -176,18 +177,18 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
             jax.block_until_ready(carry)
             report(f"stage {stage + 1}, gradient step {gradient_steps + i + CHUNK}")
         actors, gradient_steps = carry[0], gradient_steps + length
-        values = np.asarray(school.returns(test(actors, white), prior, params, key_test))
-        before, reached = reached, float(np.max(values))
-        if reached - before < ENOUGH * abs(reached):
+        stages.append(np.asarray(school.returns(fold(actors, white), prior, params, key_test)))
+        so_far = [values.max() for values in stages]
+        if so_far[-1] == max(so_far):
+            best = jax.tree.map(lambda leaf: leaf[stages[-1].argmax()], fold(actors, white))
+        if stage and so_far[-1] - max(so_far[:-1]) < ENOUGH * abs(so_far[-1]):
             break
-    best = jax.tree.map(lambda leaf: leaf[int(np.argmax(values))], test(actors, white))
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(best).items()}
     settings = {
         "slope": float(prior.slope),
         "offset": float(prior.offset),
         "gradient_steps": gradient_steps,
-        "returns": values.round(3).tolist(),
-        "gain_of_the_last_doubling": (reached - before) / abs(reached),
+        "returns": [values.round(3).tolist() for values in stages],
     }
     steps = (SEEDS * gradient_steps * BATCH + LEVELS) * plant.episode_steps
     return Tuned(settings, arrays, steps)

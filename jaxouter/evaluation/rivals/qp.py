@@ -19,7 +19,7 @@ TOLERANCE = 1e-5
 
 
 class Condensed(NamedTuple):
-    """Minimise 1/2 u'Hu + (F z)'u over low <= u <= high, rows_low <= S (free z + forced u) <= rows_high, softly."""
+    """Minimise 1/2 u'Hu + (F z)'u over low <= u <= high, |rows_free z + rows_forced u| <= rows_bound, softly."""
 
     H: np.ndarray  # (M, M)
     F: np.ndarray  # (M, n)
@@ -73,8 +73,8 @@ class Solver:
         self.qp = qp
         self.law = -np.linalg.solve(qp.H, qp.F)
         moves, rows = len(qp.H), len(qp.rows_bound)
-        # The variables are u and, where there are limits, one excess for each side of each row.
-        H = sparse.block_diag([sparse.csc_matrix(qp.H), SOFT * np.max(np.diag(qp.H)) * sparse.eye(rows)], format="csc")
+        # The variables are u and, where there are limits, an excess for each row.
+        H = sparse.block_diag([sparse.csc_matrix(qp.H), SOFT * sparse.eye(rows)], format="csc")
         bounds = sparse.hstack([sparse.eye(moves), sparse.csc_matrix((moves, rows))])
         limits = sparse.hstack([sparse.csc_matrix(qp.rows_forced), sparse.eye(rows)])
         self._low, self._high = np.full(moves, qp.low), np.full(moves, qp.high)

@@ -83,14 +83,15 @@ def coordinate_search(
             report(f"{len(known)} settings tried")
         return known.get(key, -np.inf)
 
-    best, before = dict(start), -np.inf
-    while value(best) > before:
-        before = value(best)
+    best = dict(start)
+    while True:
+        before = best
         for name, values in grid.items():
             for direction in (1, -1):
                 ahead = list(values)[list(values).index(best[name]) :: direction][1:]
                 for candidate in ({**best, name: other} for other in ahead):
-                    if value(candidate) <= value(best):
+                    if value(best) >= value(candidate):
                         break
                     best = candidate
-    return best, len(known)
+        if best == before:
+            return best, len(known)

@@ -86,6 +86,7 @@ def test_it_finds_the_reciprocal_of_the_gain_for_its_prefilter(tuned):
     assert tuned.settings["slope"] == pytest.approx(2.0, rel=1e-5)
     assert tuned.settings["offset"] == pytest.approx(0.0, abs=1e-5)
     assert tuned.settings["kp"] > 0
+    assert tuned.settings["ki"] > 0
 
 
 def test_it_leaves_no_steady_state_error_where_the_static_prefilter_does(steps):

@@ -24,7 +24,7 @@ def programme(seed, bound, row_bound=None):
 def optimum(qp, z):
     """As bounded least squares: with the rows' values within their bound as further variables, the excess is linear."""
     R = np.linalg.cholesky(qp.H).T
-    rows, price = len(qp.rows_bound), np.sqrt(SOFT * np.max(np.diag(qp.H)))
+    rows, price = len(qp.rows_bound), np.sqrt(SOFT)
     A = np.block([[R, np.zeros((MOVES, rows))], [price * qp.rows_forced, -price * np.eye(rows)]])
     b = np.concatenate([-np.linalg.solve(R.T, qp.F @ z), -price * qp.rows_free @ z])
     bound = np.concatenate([np.full(MOVES, qp.high), qp.rows_bound])
