@@ -72,8 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return cli.print_lists()
         plan = check(options)
         cli.use_compilation_cache()
-        plan.out.mkdir(parents=True)
-        done = work(plan)
+        try:
+            plan.out.mkdir(parents=True)
+        except OSError as error:
+            raise ValueError(f"the folder {plan.out} can't be made: {error.strerror}") from None
+        try:
+            done = work(plan)
+        except BaseException:
+            plan.out.rmdir()  # still empty, and its name is wanted again
+            raise
     content = assemble(plan, done)
     content |= {
         "seconds": time.perf_counter() - begun,
@@ -110,11 +117,15 @@ def check(options: Options) -> Plan:
         for run, median, chosen in runs
         for seed in (chosen if len(chosen) == 1 else sorted(chosen, key=lambda seed: seed != median))
     ]
+    contenders = list(dict.fromkeys([*contenders, *named(options.policy)]))
+    for contender in contenders:
+        if contender.kind in ("learned", "user"):
+            board.load(contender, plant)  # what can't be loaded is said before minutes of tuning
     return Plan(
         plant,
-        (*contenders, *named(options.policy)),
-        options.scenario or tuple(scenarios.catalogue(plant)),
-        tuple(sweeps.catalogue(plant)) if options.sweep is None else options.sweep,
+        tuple(contenders),
+        tuple(dict.fromkeys(options.scenario or scenarios.catalogue(plant))),
+        tuple(dict.fromkeys(sweeps.catalogue(plant) if options.sweep is None else options.sweep)),
         options.family_seed,
         folder(options.out, plant),
     )
@@ -132,6 +143,8 @@ def named(names: Sequence[str]) -> list[Contender]:
         if colon and file.endswith(".py"):
             board.load_class(Path(file), attribute)
             own.append(Contender(f"{Path(file).name}:{attribute}", "user", file, None, attribute))
+            if [c.name for c in own].count(own[-1].name) > 1:  # of several files with this name
+                own[-1] = own[-1]._replace(name=name)
         elif name in NAMES:
             built_in.append(name)
         else:
@@ -156,22 +169,22 @@ def folder(out: Path | None, plant: str) -> Path:
 
 def work(plan: Plan) -> list[Done]:
     """All jobs done, in their order, with progress."""
-    phases = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
+    jobs = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
     done: dict[Job, Done] = {}
-    with cli.JobProgress(sum(map(len, phases))) as progress:
-        for jobs in phases:
-            for finished in board.spread(jobs, cli.use_compilation_cache, progress.say):
-                done[finished.job] = finished
-                progress.advance(f"{finished.job}: {finished.seconds:.0f} s")
-    return [done[job] for jobs in phases for job in jobs]
+    with cli.JobProgress(len(jobs)) as progress:
+        for finished in board.spread(jobs, cli.use_compilation_cache, progress.say):
+            done[finished.job] = finished
+            progress.advance(f"{finished.job}: {finished.seconds:.0f} s")
+    return [done[job] for job in jobs]
 
 
 def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
     """The content of comparison.json."""
     known = board.policies(plan.contenders, done)
     rows = statistics.ranks(board.rows(done), known)
+    label = {(line.policy, line.run): line.label for line in statistics.lines(rows, known)}
     plant, _ = plants.make(plan.plant)
-    swept = board.swept(done, plan.sweeps)
+    swept = board.swept(done, plan.sweeps, label)
     for sweep in swept.values():
         sweep["best_rival"] = statistics.best_rival(sweep, known)
     return {
@@ -186,7 +199,7 @@ def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
         "rows": rows,
         "statistics": statistics.summarise(rows, known),
         "sweeps": swept,
-        "certificate": board.certificates(done),
+        "certificate": board.certificates(done, label),
     }
 
 
@@ -202,10 +215,7 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
     lines = statistics.lines(rows, content["policies"])
     label = {(line.policy, line.run): line.label for line in lines}
     for name in plan.scenarios:
-        traces = {
-            label[c.name, c.path if c.kind == "learned" else None]: t
-            for c, t in board.first_episodes(done, name).items()
-        }
+        traces = {label[c.line]: t for c, t in board.first_episodes(done, name).items()}
         traces = {line.label: traces[line.label] for line in lines}
         path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
         scenario = scenarios.get(name, family_seed=plan.family_seed)
@@ -216,7 +226,8 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
 def show(content: dict[str, Any]) -> None:
     """Print MAE and ratio to the limit, the best of each scenario in bold."""
     columns, rows = statistics.table(content["rows"], content["policies"], "[bold]{}[/bold]")
-    cli.table(f"MAE in {content['y_unit']} (ratio to the limit); bold: best; !: outside the limits", columns, rows)
+    cli.table(f"MAE, {content['y_unit']}", columns, rows)
+    print("In brackets: ratio to the limit (oracle). Bold: best without the model. !: outside the limits of the plant.")
 
 
 if __name__ == "__main__":

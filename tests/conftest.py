@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import jax
+import matplotlib
 import pytest
 
 # Tests share compiled functions with each other and with the commands that they start, not with the user's own cache.
@@ -14,6 +15,13 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def results_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Results of rivals are made anew: their cache does not know of the plants in the tests."""
+    os.environ["MPLCONFIGDIR"] = matplotlib.get_cachedir()  # else matplotlib would search all fonts again
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -204,6 +205,8 @@ def place(tmp_path, monkeypatch):
     Path("fails.py").write_text("1 / 0")
     Path("empty.py").touch()
     shutil.copy(LEAD, "lead.py")
+    Path("own.py").write_text(OWN)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
     return folder
 
 
@@ -228,6 +231,16 @@ def place(tmp_path, monkeypatch):
         (["--run", "heated", "--scenario", "pitch/paper"], "the comparison is on heaters; pitch/paper is another"),
         (["--family-seed", "-1"], "--family-seed is -1; it must lie in [0, 2^32)"),
         (["--out", "."], ". exists; choose another --out"),
+        (
+            ["--sweep", "--scenario", "pitch/paper", "--out", "lead.py/out"],
+            "the folder lead.py/out can't be made: Not a ",
+        ),
+        (["heaters", "--run", "heated"], "heated/seed-0 has no checkpoint yet"),
+        (["--policy", "own.py:NoPlant"], "own.py:NoPlant can't be made: TypeError: NoPlant() takes no arguments"),
+        (
+            ["--policy", "none", "own.py:Broken", "--scenario", "pitch/steps", "--sweep", "--out", "out"],
+            "own.py:Broken failed on pitch/steps: RuntimeError: out of ideas",
+        ),
     ],
 )
 def test_bad_input_is_one_message_and_status_2(arguments, text, capsys, place):
@@ -242,6 +255,21 @@ def test_bad_input_is_one_message_and_status_2(arguments, text, capsys, place):
     assert [path for path in sorted(place.rglob("*")) if path.name != "__pycache__" and path.suffix != ".pyc"] == before
 
 
+OWN = """
+class NoPlant:
+    host = True
+
+class Broken:
+    host = True
+    def __init__(self, plant):
+        pass
+    def init(self, params, r0, y0):
+        return ()
+    def act(self, params, carry, r, y, key=None):
+        raise RuntimeError("out of ideas")
+"""
+
+
 def test_bad_input_leaves_no_traceback(tmp_path):
     done = command("--policy", f"{LEAD}:Lag", cwd=tmp_path, cache=tmp_path / "cache")
     assert (done.returncode, done.stdout) == (2, "")
@@ -249,14 +277,18 @@ def test_bad_input_leaves_no_traceback(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_everything_is_the_default(place):
+def test_everything_is_the_default(place, monkeypatch):
     plan = compare.check(compare.Options())
     assert (plan.plant, plan.out) == ("pitch", Path("runs/compare-pitch"))
     assert [c.name for c in plan.contenders] == list(NAMES)
     assert plan.scenarios == tuple(scenarios.catalogue("pitch"))
     assert plan.sweeps == tuple(sweeps.catalogue("pitch"))
-    plan = compare.check(compare.Options(run=(Path("heated"),), policy=("lead.py:Lead",)))
-    assert (plan.plant, plan.out) == ("heaters", Path("runs/compare-heaters"))
+    monkeypatch.setitem(REGISTRY, "lag", lag.make)
+    run = Run.create(small("lag"), Path("lagging"))
+    trainer, params = run.trainer
+    run.save(0, 1, trainer.start(0, params))
+    plan = compare.check(compare.Options(run=(run.path,), policy=("lead.py:Lead",)))
+    assert (plan.plant, plan.out) == ("lag", Path("runs/compare-lag"))
     assert [c.name for c in plan.contenders] == ["learned", "lead.py:Lead", *NAMES]
 
 
@@ -269,6 +301,38 @@ def test_inner_loop_alone_is_always_there_and_no_policy_twice(run):
     assert [(c.name, c.seed) for c in plan.contenders] == [("learned", 1), ("learned", 0), ("none", None)]
     plan = compare.check(compare.Options(run=(run.path / "seed-0",), policy=("none",)))
     assert [c.seed for c in plan.contenders] == [0, None]
+
+
+def test_what_is_named_twice_counts_once_and_files_of_one_name_are_told_apart(run, place):
+    Path("other").mkdir()
+    shutil.copy(LEAD, "other/lead.py")
+    options = compare.Options(
+        run=(run.path / "seed-0", run.path / "seed-0"),
+        policy=("none", "lead.py:Lead", "other/lead.py:Lead", "lead.py:Lead"),
+        scenario=("pitch/paper", "pitch/paper"),
+        sweep=("pitch/gain", "pitch/gain"),
+    )
+    plan = compare.check(options)
+    assert [c.name for c in plan.contenders] == ["learned", "lead.py:Lead", "other/lead.py:Lead", "none"]
+    assert (plan.scenarios, plan.sweeps) == (("pitch/paper",), ("pitch/gain",))
+
+
+def test_ctrl_c_ends_it_with_130_and_leaves_nothing(tmp_path):
+    """As a terminal sends it, to all processes of the group."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jaxouter.compare", *ASKED, "--policy", "pi", "mpc", "--out", "out"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    process.stdout.readline()  # the jobs have begun
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=100)
+    assert (process.returncode, errors) == (130, "")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,9 @@ from __future__ import annotations
 import importlib.util
 import multiprocessing
 import os
+import signal
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -33,6 +36,7 @@ from jaxouter.training.run import Run
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
 SET_POINTS = 5  # of the certificate, over the range of evaluation
 LEARNED_NOTE = "The learned outer loop, without exploration."
+Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
 PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
 
 
@@ -44,6 +48,11 @@ class Contender(NamedTuple):
     path: str | None = None  # run folder, or the user's file
     seed: int | None = None  # of a run
     attribute: str = ""  # class in the user's file
+
+    @property
+    def line(self) -> tuple[str, str | None]:
+        """Policy and run, the same for all seeds."""
+        return self.name, self.path if self.kind == "learned" else None
 
 
 class Job(NamedTuple):
@@ -80,6 +89,7 @@ def load_class(path: Path, attribute: str) -> Any:
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file; a policy of your own is named FILE.py:CLASS")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
     try:
         spec.loader.exec_module(module)
     except Exception as error:
@@ -102,7 +112,10 @@ def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
         state, _ = run.load(contender.seed or 0)
         return run.trainer[0].policy, run.trainer[0].policy_params(state)
     if contender.kind == "user":
-        policy = load_class(Path(contender.path or ""), contender.attribute)(plant)
+        try:
+            policy = load_class(Path(contender.path or ""), contender.attribute)(plant)
+        except Exception as error:
+            raise ValueError(f"{contender.name} can't be made: {type(error).__name__}: {error}") from error
         return policy, getattr(policy, "params", ())
     return RIVALS[contender.name].build(plant, identified(contender.name, plant_name))
 
@@ -165,20 +178,20 @@ def run(job: Job, report: Report = lambda text: None) -> Done:
 
 def jobs(
     plant: str, contenders: Sequence[Contender], met: Sequence[str], swept: Sequence[str], family_seed: int
-) -> tuple[list[Job], list[Job]]:
-    """Jobs of identification, and those that follow; the long ones first."""
-    first = [Job("identify", c, plant) for c in reversed(contenders) if c.name in RIVALS and c.kind != "learned"]
+) -> list[Job]:
+    """All jobs: identification first, of it the long ones."""
+    work = [Job("identify", c, plant) for c in reversed(contenders) if c.name in RIVALS and c.kind != "learned"]
     acting = [c for c in contenders if c.kind != "preview"]
-    one_seed = {(c.name, c.path): c for c in reversed(acting)}  # sweeps and certificates: the first seed of each run
-    rest = [Job("meet", c, plant, on, family_seed) for on in met for c in contenders]
-    rest += [Job("sweep", c, plant, on) for on in swept for c in one_seed.values()]
-    rest += [
+    one_seed = {c.line: c for c in reversed(acting)}  # sweeps and certificates: the first seed of each run
+    work += [Job("meet", c, plant, on, family_seed) for on in met for c in contenders]
+    work += [Job("sweep", c, plant, on) for on in swept for c in one_seed.values()]
+    work += [
         Job("certify", c, plant, on, family_seed)
         for on in scenarios.stability_scenarios(plant)
         if on in met
         for c in one_seed.values()
     ]
-    return first, rest
+    return work
 
 
 class _Worker:
@@ -189,7 +202,15 @@ class _Worker:
     @classmethod
     def begin(cls, messages: Any, initialise: Callable[[], None]) -> None:
         cls.messages = messages
+        threading.Thread(target=cls.end_with_parent, daemon=True).start()
         initialise()
+
+    @staticmethod
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)  # however the command ended, its workers don't outlive it
 
     @classmethod
     def run(cls, job: Job) -> Done:
@@ -200,7 +221,7 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
     """The jobs as they get done: on a CPU in a process a core, on an accelerator one after the other.
 
     Args:
-        work: jobs that do not need each other.
+        work: jobs; those of a policy begin when its identification, where that is among them, is done.
         initialise: called first in each process; picklable.
         report: told now and then how far they are.
     """
@@ -212,16 +233,26 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
     context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
     messages = context.SimpleQueue()
     with ProcessPoolExecutor(min(cores, len(work)), context, _Worker.begin, (messages, initialise)) as pool:
-        waiting = {pool.submit(_Worker.run, job) for job in work}
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: Ctrl-C is for this process alone
+        identifying = {job.contender for job in work if job.what == "identify"}
+        free = [job for job in work if job.what == "identify" or job.contender not in identifying]
+        waiting = {pool.submit(_Worker.run, job) for job in free}
+        signal.signal(signal.SIGINT, handler)
         try:
             while waiting:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
                 while not messages.empty():
                     report(messages.get())
                 for future in done:
-                    yield future.result()
+                    finished = future.result()
+                    if finished.job.what == "identify":
+                        freed = (job for job in work if job.contender == finished.job.contender and job != finished.job)
+                        waiting |= {pool.submit(_Worker.run, job) for job in freed}
+                    yield finished
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
             raise
 
 
@@ -232,15 +263,17 @@ def policies(contenders: Sequence[Contender], done: Sequence[Done]) -> dict[str,
     for c in contenders:
         known = {"kind": c.kind, "steps": None, "seconds": None, "settings": {}, "note": ""}
         if c.kind == "learned":
-            config = Run.open(Path(c.path or "")).config
-            known |= {"steps": config.steps, "settings": {"preset": config.preset}, "note": LEARNED_NOTE}
+            paths = dict.fromkeys(other.path or "" for other in contenders if other.kind == "learned")
+            configs = {Path(path).name: Run.open(Path(path)).config for path in paths}
+            known |= {"steps": max(config.steps for config in configs.values()), "note": LEARNED_NOTE}
+            known |= {"settings": {name: config.preset for name, config in configs.items()}}
         elif c.kind == "preview":
             known |= {"note": PREVIEW_NOTE}
         elif c.kind == "user":
             known |= {"note": f"{c.attribute} of {c.path}"}
         else:
             identification = tuned[c.name]
-            known |= {"steps": identification.found.steps, "seconds": identification.seconds}
+            known |= {"steps": identification.found.steps, "seconds": identification.found.seconds}
             known |= {"settings": identification.found.settings, "note": RIVALS[c.name].note}
         found[c.name] = known
     return found
@@ -264,7 +297,7 @@ def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
         found.append(
             {
                 "policy": c.name,
-                "run": c.path if c.kind == "learned" else None,
+                "run": c.line[1],
                 "seed": c.seed,
                 "scenario": on,
                 "mae": mae,
@@ -279,29 +312,29 @@ def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
 def first_episodes(done: Sequence[Done], on: str) -> dict[Contender, Traces]:
     """Traces of the first episode of a scenario under each policy; of a run its first seed."""
     nothing = dict(reward=None, each_outside=None, each_excess=None, members=None)
-    found: dict[tuple[str, str | None], tuple[Contender, Traces]] = {}
+    found: dict[Any, tuple[Contender, Traces]] = {}
     for d in done:
         if d.job.what == "meet" and d.job.on == on:
             c = d.job.contender
-            found.setdefault((c.name, c.path), (c, Traces(**d.found.arrays, **nothing)))
+            found.setdefault(c.line, (c, Traces(**d.found.arrays, **nothing)))
     return dict(found.values())
 
 
-def swept(done: Sequence[Done], names: Sequence[str]) -> dict[str, Any]:
+def swept(done: Sequence[Done], names: Sequence[str], label: Labels) -> dict[str, Any]:
     """The sweeps as JSON values."""
     found: dict[str, Any] = {}
     for name in names:
         axes = [axis.__dict__ | {"values": list(axis.values)} for axis in sweeps.get(name).axes]
         own = [d for d in done if d.job.what == "sweep" and d.job.on == name]
-        found[name] = {"axes": axes, "policies": {d.job.contender.name: d.found.settings for d in reversed(own)}}
+        found[name] = {"axes": axes, "policies": {label[d.job.contender.line]: d.found.settings for d in reversed(own)}}
     return found
 
 
-def certificates(done: Sequence[Done]) -> list[Mapping[str, Any]]:
+def certificates(done: Sequence[Done], label: Labels) -> list[Mapping[str, Any]]:
     """The certificates as JSON values."""
     certified = [d for d in done if d.job.what == "certify"]
     return [
-        {"policy": d.job.contender.name, "scenario": d.job.on, **row}
+        {"policy": label[d.job.contender.line], "scenario": d.job.on, **row}
         for d in certified
         for row in d.found.settings["rows"]
     ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import threading
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -18,7 +20,7 @@ import jaxouter
 
 PACKAGE = Path(jaxouter.__file__).parent
 SOURCES = ("plants", "loop", "agents", "training", "evaluation/rivals")
-FILES = ("metrics.py", "rollout.py", "scenarios.py", "sweeps.py", "certificate.py")
+FILES = ("metrics.py", "rollout.py", "scenarios.py", "sweeps.py", "certificate.py", "board.py", "cache.py")
 
 
 class Tuned(NamedTuple):
@@ -27,6 +29,7 @@ class Tuned(NamedTuple):
     settings: dict[str, Any]  # as JSON
     arrays: dict[str, np.ndarray]
     steps: int  # environment steps
+    seconds: float = 0.0  # that it took when it was made; `cached` says
 
 
 def folder() -> Path:
@@ -53,16 +56,22 @@ def cached(name: str, key: Mapping[str, Any], make: Callable[[], Tuned]) -> Tune
     text = json.dumps({"code": code(), **key}, sort_keys=True)
     path = folder() / "rivals" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
-            return Tuned(header["settings"], {n: file[n] for n in file.files if n != "header"}, header["steps"])
+            arrays = {name: file[name] for name in file.files if name != "header"}
+            return Tuned(arrays=arrays, **header)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         pass  # absent or damaged: made again
+    begin = time.perf_counter()
     made = make()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".{os.getpid()}")
+    made = made._replace(seconds=time.perf_counter() - begin)
+    partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"the cache folder {path.parent} can't be made: {error.strerror}") from None
     with partial.open("wb") as file:
-        header = json.dumps({"settings": made.settings, "steps": made.steps})
+        header = json.dumps({"settings": made.settings, "steps": made.steps, "seconds": made.seconds})
         np.savez(file, allow_pickle=False, header=np.asarray(header), **made.arrays)
     partial.replace(path)
     return made

@@ -28,8 +28,8 @@ EPISODES = 10  # length of the simulation from whose end the equilibrium is soug
 TOLERANCE = 1e-11  # residual of an equilibrium, as share of the range of r~ or of the largest variable
 NEAR = 1e-7  # what is this near a bound or a kink counts as at it; share of the range of r~
 JUMP = 1e-3  # a Jacobian that changes by more within NEAR has a kink; share of the largest entry of the row
-NEWTON_STEPS = 50
-HALVINGS = 12
+NEWTON_STEPS = 25
+HALVINGS = 8
 DENSE = 400  # variables up to which linear algebra is dense
 
 
@@ -161,7 +161,8 @@ def certify(
     loop = _Loop(plant, policy)
     with jax.enable_x64(True):
         policy_params, params = jax.tree.map(_double, (policy_params, params))
-        given = [_Given(policy_params, plant.noise_free(params), jnp.asarray(r, float)) for r in set_points]
+        params = plant.noise_free(plant.smallest(params))
+        given = [_Given(policy_params, params, jnp.asarray(r, float)) for r in set_points]
         if given and not _time_invariant(loop, given[0]):
             return [_nothing(r, "depends on a clock or on noise that is not declared") for r in set_points]
         return [_certify(loop, each) for each in given]

@@ -264,7 +264,11 @@ def best_rival(sweep: Mapping[str, Any], policies: Policies) -> dict[str, Any] |
         values (a list an axis), mae and policy (nested lists, None where every rival diverged); None without a rival
         or a common point.
     """
-    rivals = {name: swept for name, swept in sweep["policies"].items() if policies[name]["kind"] == "rival"}
+    rivals = {
+        name: swept
+        for name, swept in sweep["policies"].items()
+        if name in policies and policies[name]["kind"] == "rival"
+    }
     if not rivals:
         return None
     grids = [swept["values"] for swept in rivals.values()]

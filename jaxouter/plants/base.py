@@ -86,6 +86,8 @@ class Plant:
     infinity) with these variables and the constants of `state`. Its step must not depend on clocks any more."""
     noise_free: Callable[[Any], Any] = lambda params: params
     """`noise_free(params) -> params`: the same plant without noise."""
+    smallest: Callable[[Any], Any] = lambda params: params
+    """`smallest(params) -> params`: the same plant, of given (not traced) numbers, with no more state than it needs."""
 
     def __post_init__(self) -> None:
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):

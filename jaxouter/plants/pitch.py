@@ -125,7 +125,7 @@ def make(
     A, B, Q = array("A", A, (4, 4)), array("B", B, (4,)), array("Q", Q, (5,))
     delays = {name: float(numbers[name]) for name in ("tau", "d1", "d2")}
     if max_delay is None and all(map(math.isfinite, delays.values())):
-        max_delay = max(0.0, math.ceil(round(max(delays.values()) / CONTROL_STEP, 5)) * CONTROL_STEP)
+        max_delay = _enough(*delays.values())
     if max_delay is not None and not 0.0 <= max_delay < math.inf:
         raise ValueError(f"max_delay is {max_delay:g} s; it must be a number of at least 0")
     for name, value in delays.items():
@@ -151,6 +151,16 @@ def make(
         substeps=substeps,
     )
     return PITCH, params
+
+
+def _enough(*delays: float) -> float:
+    """The smallest `max_delay` that serves these delays, s."""
+    return max(0.0, math.ceil(round(max(delays) / CONTROL_STEP, 5)) * CONTROL_STEP)
+
+
+def smallest(params: PitchParams) -> PitchParams:
+    """The same plant with the shortest delay lines that serve it."""
+    return params.replace(max_delay=_enough(float(params.tau), float(params.d1), float(params.d2)))
 
 
 def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
@@ -256,6 +266,7 @@ PITCH = Plant(
     start=start,
     variables=variables,
     settled=settled,
+    smallest=smallest,
     y_unit="crad",
     time_unit="s",
     control_step=CONTROL_STEP,

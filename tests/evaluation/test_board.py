@@ -145,6 +145,11 @@ def by_policy(done: list[Done]) -> dict[str, dict]:
     return {row["policy"]: row for row in board.rows(done)}
 
 
+def after(*arguments):
+    """Jobs that follow identification."""
+    return [job for job in board.jobs(*arguments) if job.what != "identify"]
+
+
 def test_rows_have_ratios_to_limit_and_bound_and_the_improvement_over_the_inner_loop():
     contenders = {LEARNED[0]: 3.0, LEARNED[1]: 6.0, NONE: 8.0, ORACLE: 2.0, CLAIRVOYANT: 1.5}
     rows = board.rows([met(c, "pitch/paper", mae) for c, mae in contenders.items()])
@@ -205,7 +210,7 @@ ALL = (*LEARNED, OTHER_RUN, USER, NONE, STATIC, ORACLE, CLAIRVOYANT)
 
 def test_every_contender_meets_every_scenario():
     names = ["pitch/paper", "pitch/steps"]
-    _, rest = board.jobs("pitch", ALL, names, [], 7)
+    rest = after("pitch", ALL, names, [], 7)
     meetings = [(job.contender, job.on) for job in rest if job.what == "meet"]
     assert meetings == [(c, on) for on in names for c in ALL]
     assert {job.family_seed for job in rest if job.what == "meet"} == {7}
@@ -213,13 +218,13 @@ def test_every_contender_meets_every_scenario():
 
 
 def test_only_rivals_and_the_limit_are_identified():
-    first, _ = board.jobs("pitch", ALL, ["pitch/paper"], [], 7)
+    first = [job for job in board.jobs("pitch", ALL, ["pitch/paper"], [], 7) if job.what == "identify"]
     assert {job.what for job in first} == {"identify"}
     assert [job.contender for job in first] == [ORACLE, STATIC, NONE]  # the longest first
 
 
 def test_sweeps_take_the_first_seed_of_each_run_and_nothing_with_preview():
-    _, rest = board.jobs("pitch", ALL, ["pitch/steps"], ["pitch/gain", "pitch/pilot-delay"], 7)
+    rest = after("pitch", ALL, ["pitch/steps"], ["pitch/gain", "pitch/pilot-delay"], 7)
     acting = {LEARNED[0], OTHER_RUN, USER, NONE, STATIC, ORACLE}
     for name in ("pitch/gain", "pitch/pilot-delay"):
         swept = [job.contender for job in rest if (job.what, job.on) == ("sweep", name)]
@@ -228,12 +233,12 @@ def test_sweeps_take_the_first_seed_of_each_run_and_nothing_with_preview():
 
 
 def test_certificates_on_the_stability_scenarios_that_were_asked_for():
-    _, rest = board.jobs("pitch", ALL, ["pitch/steps", "pitch/uncertainty", "pitch/paper", "pitch/noise"], [], 7)
+    rest = after("pitch", ALL, ["pitch/steps", "pitch/uncertainty", "pitch/paper", "pitch/noise"], [], 7)
     certified = [(job.on, job.contender) for job in rest if job.what == "certify"]
     acting = {LEARNED[0], OTHER_RUN, USER, NONE, STATIC, ORACLE}
     assert len(certified) == 2 * len(acting)
     assert set(certified) == {(on, c) for on in ("pitch/paper", "pitch/uncertainty") for c in acting}
-    _, rest = board.jobs("pitch", ALL, ["pitch/steps"], [], 7)
+    rest = after("pitch", ALL, ["pitch/steps"], [], 7)
     assert {job.what for job in rest} == {"meet"}
 
 
@@ -272,6 +277,13 @@ def test_users_policies_in_jax_and_in_plain_python_do_the_same(own):
     assert board.load(own("Host"), "lag")[1] == ()
 
 
+def test_file_whose_annotations_are_strings_can_be_imported(tmp_path):
+    """Dataclasses look for them in `sys.modules`."""
+    path = tmp_path / "own.py"
+    path.write_text("from __future__ import annotations\n" + OWN.strip())
+    assert board.load_class(path, "Jax")(lag.LAG).bounds == (-4.0, 4.0)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
@@ -300,7 +312,7 @@ def test_folder_is_no_file_of_a_policy(tmp_path):
     ("name", "text"),
     [
         ("Broken", "own.py:Broken failed on lag/steps: RuntimeError: out of ideas"),
-        ("NoPlant", "own.py:NoPlant failed on lag/steps: TypeError: "),
+        ("NoPlant", "own.py:NoPlant failed on lag/steps: ValueError: own.py:NoPlant can't be made: "),
         ("NoHost", "own.py:NoHost failed on lag/steps: AttributeError: 'NoHost' object has no attribute 'host'"),
     ],
 )
@@ -428,12 +440,14 @@ def no_process() -> None:
 def test_policies_say_what_they_are_and_what_they_took(run):
     contenders = [Contender("learned", "learned", str(run.path), seed) for seed in (1, 0)]
     contenders += [USER, NONE, STATIC, CLAIRVOYANT]
-    tuned = [Done(Job("identify", c, "lag"), identified(c.name, "lag"), 2.5) for c in (STATIC, NONE)]
+    tuned = [
+        Done(Job("identify", c, "lag"), identified(c.name, "lag")._replace(seconds=2.5), 0.0) for c in (STATIC, NONE)
+    ]
     known = board.policies(contenders, tuned)
     assert list(known) == ["learned", USER.name, "none", "static", "clairvoyant"]
     assert {name: each["kind"] for name, each in known.items()} == {c.name: c.kind for c in contenders}
     assert known["learned"]["steps"] == run.config.steps
-    assert known["learned"]["settings"] == {"preset": "default"}
+    assert known["learned"]["settings"] == {run.path.name: "default"}
     assert known[USER.name]["note"] == "Twice of own.py"
     assert (known["static"]["steps"], known["static"]["seconds"]) == (400, 2.5)
     assert known["static"]["settings"] == identified("static", "lag").settings
@@ -458,8 +472,22 @@ def test_sweeps_and_certificates_as_json():
     done = [Done(Job("sweep", c, "pitch", "pitch/gain"), Tuned(swept, {}, 0), 0.1) for c in (STATIC, NONE)]
     rows = [{"set_point": r, "spectral_radius": 0.9, "note": ""} for r in (0.0, 1.0)]
     done += [Done(Job("certify", NONE, "pitch", "pitch/paper"), Tuned({"rows": rows}, {}, 0), 0.1)]
-    (gain,) = board.swept(done, ["pitch/gain"]).values()
+    label = {c.line: c.name for c in (NONE, STATIC)}
+    (gain,) = board.swept(done, ["pitch/gain"], label).values()
     assert gain["policies"] == {"none": swept, "static": swept}
     axis = sweeps.get("pitch/gain").axes[0]
     assert gain["axes"] == [{"name": "gain", "unit": "1", "values": list(axis.values), "nominal": 1.0}]
-    assert board.certificates(done) == [{"policy": "none", "scenario": "pitch/paper", **row} for row in rows]
+    assert board.certificates(done, label) == [{"policy": "none", "scenario": "pitch/paper", **row} for row in rows]
+
+
+def test_two_runs_keep_their_own_sweeps_and_certificates():
+    runs = {LEARNED[0]: 1.0, OTHER_RUN: 2.0}
+    rows = [{"set_point": 0.0, "spectral_radius": 0.9, "note": ""}]
+    done = [
+        Done(Job("sweep", c, "pitch", "pitch/gain"), Tuned({"values": [[1.0]], "mae": [mae]}, {}, 0), 0.1)
+        for c, mae in runs.items()
+    ] + [Done(Job("certify", c, "pitch", "pitch/paper"), Tuned({"rows": rows}, {}, 0), 0.1) for c in runs]
+    label = {c.line: f"learned {c.path[-1]}" for c in runs}
+    swept = board.swept(done, ["pitch/gain"], label)["pitch/gain"]["policies"]
+    assert {name: each["mae"] for name, each in swept.items()} == {"learned a": [1.0], "learned b": [2.0]}
+    assert [row["policy"] for row in board.certificates(done, label)] == ["learned a", "learned b"]

@@ -1,7 +1,8 @@
 import multiprocessing
 import shutil
+import time
 import zipfile
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,7 @@ def test_folder_is_the_users_own(tmp_path, monkeypatch):
         assert cache.folder() == Path.home() / ".cache" / "jaxouter"
 
 
-@pytest.mark.parametrize("damage", ["empty", "text", "flipped", "without header", "pickle"])
+@pytest.mark.parametrize("damage", ["empty", "text", "truncated", "flipped", "without header", "pickle"])
 def test_damaged_file_is_made_again(damage):
     cache.cached("pitch-pi", KEY, Maker())
     (path,) = files()
@@ -87,12 +88,25 @@ def test_damaged_file_is_made_again(damage):
     else:
         flipped = bytearray(content)
         flipped[content.index(TUNED.arrays["a"].tobytes())] ^= 1
-        path.write_bytes({"empty": b"", "text": b"hello", "flipped": flipped}[damage])
+        path.write_bytes({"empty": b"", "text": b"hello", "truncated": content[:-30], "flipped": flipped}[damage])
     again = Maker()
     assert_equal(cache.cached("pitch-pi", KEY, again), TUNED)
     assert again.calls == 1
     assert_equal(cache.cached("pitch-pi", KEY, never), TUNED)
     assert files() == [path]
+
+
+def test_time_that_it_took_is_kept():
+    made = cache.cached("pitch-pi", KEY, lambda: time.sleep(0.05) or TUNED)
+    assert made.seconds >= 0.05
+    assert cache.cached("pitch-pi", KEY, never).seconds == made.seconds
+
+
+def test_folder_that_cannot_be_made_is_named(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(ValueError, match="rivals can't be made: Not a directory"):
+        cache.cached("pitch-pi", KEY, Maker())
 
 
 def test_nothing_is_pickled():
@@ -140,6 +154,8 @@ def code() -> str:
         "evaluation/scenarios.py",
         "evaluation/sweeps.py",
         "evaluation/certificate.py",
+        "evaluation/board.py",
+        "evaluation/cache.py",
     ],
 )
 def test_results_are_made_again_when_the_source_that_they_depend_on_changes(package, source):
@@ -170,8 +186,9 @@ def _write_many(which: int) -> list[float]:
     return [each.settings["by"] for each in found if (each.arrays["by"] == each.settings["by"]).all()]
 
 
-def test_two_processes_at_once_leave_whole_files():
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+@pytest.mark.parametrize("threads", [False, True])
+def test_two_at_once_leave_whole_files(threads):
+    with ThreadPoolExecutor(2) if threads else ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         first, second = pool.map(_write_many, (1, 2))
     assert len(first) == len(second) == 40
     assert len(files()) == 40

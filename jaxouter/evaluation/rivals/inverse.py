@@ -44,8 +44,7 @@ class Inverse:
 
     def wanted(self, params: Any, memory: Memory, target: jax.Array, y: jax.Array) -> jax.Array:
         """Network: r~ over half its range, before it is clipped, from the memory at t, y_t and y_(t+h)."""
-        features = self.observer.features(memory._replace(integral=jnp.zeros_like(y)), target, y)
-        return Actor(self.hidden, 1).apply(params, features)[0]  # pyright: ignore
+        return Actor(self.hidden, 1).apply(params, self.observer.features(memory, target, y))[0]  # pyright: ignore
 
     def init(self, params: Any, r0: jax.Array, y0: jax.Array) -> Memory:
         """Memory before the first step."""
@@ -58,6 +57,7 @@ class Inverse:
         """Ask the network for r."""
         del key
         low, high = self.observer.r_tilde_bounds
+        carry = carry._replace(integral=jnp.zeros_like(y))
         r_tilde = jnp.clip((low + high) / 2 + (high - low) / 2 * self.wanted(params, carry, r, y), low, high)
         return self.observer.record(carry, y, r_tilde), r_tilde
 
