@@ -6,6 +6,7 @@ Units: x1 = u, x2 = w in ft/s, x3 = q in crad/s, x4 = theta in crad (1 crad = 0.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -160,7 +161,7 @@ def _enough(*delays: float) -> float:
 
 def smallest(params: PitchParams) -> PitchParams:
     """The same plant with the shortest delay lines that serve it."""
-    return params.replace(max_delay=_enough(float(params.tau), float(params.d1), float(params.d2)))
+    return dataclasses.replace(params, max_delay=_enough(float(params.tau), float(params.d1), float(params.d2)))
 
 
 def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
