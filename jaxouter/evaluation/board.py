@@ -182,14 +182,15 @@ def jobs(
     """All jobs: identification first, of it the long ones."""
     work = [Job("identify", c, plant) for c in reversed(contenders) if c.name in RIVALS and c.kind != "learned"]
     acting = [c for c in contenders if c.kind != "preview"]
-    one_seed = {c.line: c for c in reversed(acting)}  # sweeps and certificates: the first seed of each run
+    first_seeds = {c.line: c for c in reversed(acting)}  # of each run, for sweeps and certificates
+    one_seed = [c for c in acting if first_seeds[c.line] == c]
     work += [Job("meet", c, plant, on, family_seed) for on in met for c in contenders]
-    work += [Job("sweep", c, plant, on) for on in swept for c in one_seed.values()]
+    work += [Job("sweep", c, plant, on) for on in swept for c in one_seed]
     work += [
         Job("certify", c, plant, on, family_seed)
         for on in scenarios.stability_scenarios(plant)
         if on in met
-        for c in one_seed.values()
+        for c in one_seed
     ]
     return work
 
@@ -326,7 +327,7 @@ def swept(done: Sequence[Done], names: Sequence[str], label: Labels) -> dict[str
     for name in names:
         axes = [axis.__dict__ | {"values": list(axis.values)} for axis in sweeps.get(name).axes]
         own = [d for d in done if d.job.what == "sweep" and d.job.on == name]
-        found[name] = {"axes": axes, "policies": {label[d.job.contender.line]: d.found.settings for d in reversed(own)}}
+        found[name] = {"axes": axes, "policies": {label[d.job.contender.line]: d.found.settings for d in own}}
     return found
 
 

@@ -12,6 +12,7 @@ from jaxouter.evaluation.rollout import Traces, excess
 from jaxouter.evaluation.scenarios import Scenario
 
 BAND = 0.05  # of the step, for the settling time
+ROUNDING = 1e-4  # in the unit of y, by which a limit that is just met may be exceeded
 
 
 def mae(traces: Traces) -> float:
@@ -61,7 +62,7 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
             values["settling_time"] = median if np.isfinite(median) else None
     if plant.output_limit is not None or plant.rate_limit is not None:
         over = np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
-        values["violation_time"], values["violation_max"] = float((over > 0).mean()), float(max(0.0, over.max()))
+        values["violation_time"], values["violation_max"] = float((over > ROUNDING).mean()), float(max(0.0, over.max()))
         if plant.members is not None:
             values["violation_time_each"] = float(traces.each_outside.mean())
             values["violation_max_each"] = float(max(0.0, traces.each_excess.max()))

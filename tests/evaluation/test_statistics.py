@@ -155,3 +155,10 @@ def test_best_rival_is_of_the_points_that_all_rivals_have():
 def test_values_on_another_grid_are_missing_where_the_policy_did_not_run():
     swept = {"values": [[0.0, 0.30000000000000004]], "mae": [1.0, None]}
     np.testing.assert_array_equal(statistics.on_grid(swept, [[0.0, 0.1, 0.3]]), [1.0, np.nan, np.nan])
+
+
+def test_table_has_a_line_a_scenario_and_marks_the_best_and_what_left_the_limits():
+    rows = [*seeds([1.0, 2.0, 4.0]), row("none", "a", 8.0, within=False), row("oracle", "a", 1.9), row("pi", "a", None)]
+    columns, body = statistics.table(statistics.ranks(rows, POLICIES), POLICIES, "*{}*")
+    assert columns == ["scenario", "learned", "none", "pi", "oracle"]
+    assert body == [["a", "*2 (1.00)*", "8 (4.00)!", "diverged", "1.9 (0.95)"]]

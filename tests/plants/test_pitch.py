@@ -270,3 +270,12 @@ def test_output_is_differentiable_in_the_modified_reference() -> None:
     slope = jax.grad(last)(scalar(16.0))
     difference = (run(17.0)[-1] - run(15.0)[-1]) / 2  # exact: the plant is affine in r~
     assert float(slope) == pytest.approx(difference, rel=1e-3)
+
+
+def test_smallest_is_the_same_plant_with_shorter_lines():
+    plant, params = make("pitch", d1=0.57, max_delay=5.7)
+    small = plant.smallest(params)
+    assert small.max_delay == pytest.approx(0.6)
+    r_tilde, key = jnp.full(60, 16.0), jax.random.key(0)
+    expected = simulate(plant, params, r_tilde, key)
+    np.testing.assert_allclose(simulate(plant, small, r_tilde, key), expected, atol=1e-4)
