@@ -32,21 +32,21 @@ class Options:
     preview. What concerns them is computed once and kept in the cache folder; the first time takes minutes.
     """
 
-    plant: Annotated[str | None, tyro.conf.Positional] = None
-    """Plant; default: that of the runs, or pitch."""
-    run: tuple[Path, ...] = ()
+    plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
+    """pitch or heaters; default: that of the runs, or pitch."""
+    run: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")] = ()
     """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
-    policy: tuple[str, ...] = ()
-    """Names of those to compare with (default: all; none always), and FILE.py:CLASS for policies of your own."""
-    scenario: tuple[str, ...] = ()
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()
+    """Rivals and limits to compare with; default: all; none always. FILE.py:CLASS is a policy of your own."""
+    scenario: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...", help_behavior_hint="")] = ()
     """Scenarios, such as pitch/paper; default: all of the plant; see --list."""
-    sweep: tuple[str, ...] | None = None
+    sweep: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")] = None
     """Sweeps, such as pitch/gain; default: all of the plant; without a name: no sweep."""
     family_seed: int = scenarios.FAMILY_SEED
     """Seed of the reference families."""
-    out: Path | None = None
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the results, which must not exist; default: runs/compare-PLANT."""
-    list: bool = False
+    list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print plants, presets, scenarios, sweeps and policies, and end."""
 
 
