@@ -3,12 +3,9 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter import plants
-from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import deepc, mpc
 from jaxouter.evaluation.rivals.deepc import Settings
@@ -21,15 +18,6 @@ KEY = jax.random.key(0)
 PAST, HORIZON, GAIN = 6, 10, 0.5
 SETTINGS = Settings(PAST, HORIZON, move_weight=0.01, g_weight=1.0, margin=1.0)
 BUDGET = 2_500 + 400 + 10 * 800
-
-
-@pytest.fixture(scope="module")
-def steps():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(plants.REGISTRY, "lag", lag.make)
-        scenario = scenarios.get("lag/steps", 8)
-    far = jnp.array([-1.0, -0.5, -0.2, -0.1, 0.1, 0.3, 0.6, 1.0])
-    return replace(scenario, r=jnp.broadcast_to(far[:, None], scenario.r.shape))
 
 
 @pytest.fixture(scope="module")

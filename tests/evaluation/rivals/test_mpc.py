@@ -3,12 +3,9 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter import plants
-from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import clairvoyant, mpc
 from jaxouter.evaluation.rivals.mpc import Settings, innovations_form
@@ -22,16 +19,6 @@ HALF = np.exp(-0.05 / 0.3)
 TRUE = ARX(np.array([HALF**2, 0.0]), 0.5 * (1 - HALF) * np.array([1.0, HALF]), 0.0, 2, 1e-6)
 SETTINGS = Settings(horizon=10, move_weight=0.01, disturbance=1e-3, margin=1.0)
 BUDGET = 2_500 + 12 * 800
-
-
-@pytest.fixture(scope="module")
-def steps():
-    """Set-points of either sign, near and far, from rest."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(plants.REGISTRY, "lag", lag.make)
-        scenario = scenarios.get("lag/steps", 8)
-    far = jnp.array([-1.0, -0.5, -0.2, -0.1, 0.1, 0.3, 0.6, 1.0])
-    return replace(scenario, r=jnp.broadcast_to(far[:, None], scenario.r.shape))
 
 
 @pytest.fixture(scope="module")
