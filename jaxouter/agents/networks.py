@@ -7,17 +7,16 @@ from typing import Any
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 
 
-def dense(features: int, fan_in: int, limit: float | None = None) -> nn.Dense:
-    """A dense layer, weights and biases uniform in plus or minus `limit` (None: 1/sqrt(fan_in))."""
+def dense(features: int, fan_in: int, limit: float | None = None, **rest: Any) -> nn.Dense:
+    """A dense layer, weights and biases uniform in plus or minus `limit` (None: 1/sqrt(fan_in)); `rest` as in flax."""
     bound = fan_in**-0.5 if limit is None else limit
 
     def uniform(key: jax.Array, shape: Sequence[int], dtype: Any = float) -> jax.Array:
         return jax.random.uniform(key, shape, dtype, -bound, bound)
 
-    return nn.Dense(features, kernel_init=uniform, bias_init=uniform, param_dtype=float)
+    return nn.Dense(features, kernel_init=uniform, bias_init=uniform, param_dtype=float, **rest)
 
 
 class Actor(nn.Module):
@@ -46,8 +45,11 @@ class Critic(nn.Module):
         """Obs (..., n), action (..., actions) -> Q (...)."""
         x = obs
         for i, features in enumerate(self.hidden):
-            x = jnp.concatenate([x, action], -1) if i == 1 else x
-            x = dense(features, x.shape[-1])(x)
+            if i == 1:  # weights of their own: the gradient in the action then costs no pass through the first layer
+                fan_in = x.shape[-1] + action.shape[-1]
+                x = dense(features, fan_in)(x) + dense(features, fan_in, use_bias=False, name="action")(action)
+            else:
+                x = dense(features, x.shape[-1])(x)
             x = nn.LayerNorm(param_dtype=float)(x) if self.layer_norm else x
             x = nn.relu(x)
         return dense(1, x.shape[-1], 3e-3)(x)[..., 0]

@@ -20,7 +20,9 @@ FAMILY_MEMBERS = 64
 NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
 PITCH_SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
-PITCH_MAX_DELAY = 5.7  # s; one length of the delay lines for all scenarios, so that they share a compilation
+PITCH_MAX_DELAY = (
+    5.7  # s; one length of the delay lines for all scenarios with delays of u, which so share a compilation
+)
 HEATERS_SETPOINTS = (15.0, 20.0, 17.0, 22.0)  # degC, 50 h each
 
 
@@ -67,13 +69,14 @@ def _pitch(
 ) -> Builder:
     def build(wanted: int | None) -> Scenario:
         n = wanted or episodes
-        plant, params = make("pitch", max_delay=PITCH_MAX_DELAY, **overrides)
+        lines = {"max_delay": PITCH_MAX_DELAY} if "d1" in overrides else {}
+        plant, params = make("pitch", **overrides)
         changed = None
         if change is not None:
-            after = make("pitch", max_delay=PITCH_MAX_DELAY, **overrides, **change)[1]
+            after = make("pitch", **overrides, **change)[1].replace(**lines)
             changed = (plant.episode_steps // 2, _repeat(after, n))
         r = jnp.full(plant.episode_steps, PITCH_SETPOINT)
-        return _scenario(name, plant, params, r, n, change=changed, **(rest or {}))
+        return _scenario(name, plant, params.replace(**lines), r, n, change=changed, **(rest or {}))
 
     return build
 
@@ -110,7 +113,7 @@ def _family(name: str, kind: str, family_seed: int) -> Builder:
 
     def build(wanted: int | None) -> Scenario:
         n = wanted or FAMILY_MEMBERS
-        overrides: dict[str, Any] = {"pitch": {"max_delay": PITCH_MAX_DELAY}, "heaters": {"n": 1000}}.get(name, {})
+        overrides: dict[str, Any] = {"n": 1000} if name == "heaters" else {}
         plant, params = make(name, **overrides)
         steps = plant.episode_steps if kind == "steps" else plant.family_steps
         keys = jax.random.split(jax.random.fold_in(jax.random.key(family_seed), list(FAMILIES).index(kind)), n)

@@ -130,9 +130,9 @@ def catalogue(name: str) -> dict[str, Builder]:
     pitch, heaters = partial(_sweep, "pitch/paper"), partial(_sweep, "heaters/paper-1000")
     own = {
         "pitch": [
-            pitch("pilot-delay", (tau,), 5, 1, _parameters("tau", max_delay=2.0)),
-            pitch("controller-delays", delays, 6, 1, _parameters("d1", "d2", max_delay=6.0)),
-            pitch("gain", (gain,), 5, 1, _parameters("gain", max_delay=0.5)),
+            pitch("pilot-delay", (tau,), 5, 1, _parameters("tau", max_delay=2.0, late=None)),
+            pitch("controller-delays", delays, 6, 1, _parameters("d1", "d2", max_delay=6.0, late=None)),
+            pitch("gain", (gain,), 5, 1, _parameters("gain")),
             pitch("sensor-noise", (noise_pitch,), 5, 8, _noise),
         ],
         "heaters": [

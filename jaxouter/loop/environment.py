@@ -9,6 +9,7 @@ The action is r~ itself, in the plant's unit. One environment is unbatched; vmap
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.custom_batching import custom_vmap
 
 from jaxouter.loop import rewards, sensor
 from jaxouter.loop.observation import Memory, Observer
@@ -119,10 +121,39 @@ class Environment:
         """
         key_step, key_reset = jax.random.split(key)
         obs, after, reward, terminated, truncated, info = self.step_env(key_step, state, action, params)
-        new_obs, new = self.reset(key_reset, params)
         done = terminated | truncated
+        new_obs, new = _if_any(done, self.reset, (key_reset, params), (obs, after))
+        new = new._replace(plant=self.plant.reuse(after.plant, new.plant))
         obs, after = jax.tree.map(lambda a, b: jnp.where(done, a, b), (new_obs, new), (obs, after))
         return obs, after, reward, terminated, truncated, info
+
+
+def _if_any(needed: jax.Array, function: Callable[..., Any], operands: tuple[Any, ...], otherwise: Any) -> Any:
+    """function(*operands) where it is needed (bool scalar); elsewhere that or `otherwise`, of the same structure.
+
+    Under vmap the function runs as soon as one lane needs it, and not at all if none does, where `cond` would become a
+    `select` and run it always. A reset is needed once in an episode, but costs more than a step.
+    """
+
+    @custom_vmap
+    def call(needed: jax.Array, operands: tuple[Any, ...], otherwise: Any) -> Any:
+        return jax.lax.cond(
+            needed, lambda operands, _: function(*operands), lambda _, other: other, operands, otherwise
+        )
+
+    @call.def_vmap
+    def lanes(size: int, batched: list[Any], needed: jax.Array, operands: tuple[Any, ...], otherwise: Any) -> Any:
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[1])
+        function_of_all = jax.vmap(function, axes, axis_size=size)
+        others = jax.tree.map(
+            lambda leaf, is_batched: leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape)),
+            otherwise,
+            batched[2],
+        )
+        out = _if_any(jnp.any(needed), function_of_all, operands, others)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return call(needed, operands, otherwise)
 
 
 def make(

@@ -30,6 +30,11 @@ def params(noise: float = 0.0, bias: float = 0.0, missing: float = 0.0) -> Senso
 
 def measure(p: SensorParams, key: chex.PRNGKey, y: jax.Array, last: jax.Array) -> jax.Array:
     """What is seen of y (scalar), when `last` was seen before."""
-    noise, chance = jax.random.normal(key, (2,), y.dtype)  # one draw: each one more costs time to compile
-    lost = jax.scipy.special.ndtr(chance) < p.missing
-    return jnp.where(lost, last, y + p.bias + p.noise * noise)
+
+    def disturbed(key: chex.PRNGKey) -> jax.Array:
+        noise, chance = jax.random.normal(key, (2,), y.dtype)  # one draw: each one more costs time to compile
+        lost = jax.scipy.special.ndtr(chance) < p.missing
+        return jnp.where(lost, last, y + p.bias + p.noise * noise)
+
+    # Numbers are drawn only where they matter, as long as the sensor is the same for all.
+    return jax.lax.cond((p.noise > 0) | (p.missing > 0), disturbed, lambda key: y + p.bias, key)

@@ -75,6 +75,9 @@ class Plant:
     """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
     draw: Callable[[chex.PRNGKey, Any], Any] | None = None
     """`draw(key, params) -> params`: parameters of a training episode (domain randomisation); None: the given ones."""
+    reuse: Callable[[Any, Any], Any] = lambda old, fresh: fresh
+    """`reuse(old, fresh) -> state`: the fresh state, with what of the old one need not be cleared at a reset (the
+    contents of delay lines), so that it isn't copied."""
     members: Callable[[Any, Any], jax.Array] | None = None
     """`members(params, state) -> (n,)`: the single outputs of which y is a weighted mean; None: y is all there is."""
 

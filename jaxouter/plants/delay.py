@@ -2,9 +2,14 @@
 
 A line of length L holds the last L samples of a signal; sample number m lies in row m mod L, m = 0 at the start of the
 episode. Before sample 0 every line is zero, whatever the rows hold: a line need not be cleared to be reset.
+
+Where n samples are written at once, the line ends with a mirror of its first n rows, so that n + 1 consecutive samples
+are one slice. Lines that are written and read in blocks may have trailing axes, and so may their lags.
 """
 
 from __future__ import annotations
+
+import math
 
 import chex
 import jax
@@ -16,9 +21,60 @@ def length(max_delay: float, sample_time: float) -> int:
     return round(max_delay / sample_time) + 4
 
 
+def block_length(max_delay: float, block_time: float, n: int) -> int:
+    """Rows, mirror included, of a line of n samples a block, for delays up to `max_delay` (unit of `block_time`)."""
+    return n * (math.ceil(round(max_delay / block_time, 5)) + 1)
+
+
 def write(line: jax.Array, newest: jax.Array, sample: jax.Array) -> jax.Array:
     """`line` (L,) with sample number `newest` (int scalar) set to `sample` (scalar)."""
     return jax.lax.dynamic_update_index_in_dim(line, sample, newest % line.shape[0], 0)
+
+
+def write_block(lines: jax.Array, block: jax.Array, samples: jax.Array) -> jax.Array:
+    """`lines` (S, L, ...) with block number `block` (int scalar) set to `samples` (S, n, ...)."""
+    n = samples.shape[1]
+    position = block * n % (lines.shape[1] - n)
+    lines = jax.lax.dynamic_update_slice_in_dim(lines, samples, position, 1)
+    mirror = jnp.where(position == 0, lines.shape[1] - n, position)  # the same place again: no branch
+    return jax.lax.dynamic_update_slice_in_dim(lines, samples, mirror, 1)
+
+
+def _rows(line: jax.Array, start: jax.Array, n: int) -> jax.Array:
+    """Read n rows of `line` (L, ...) from `start` (scalar, or of its trailing axes) on; (n, ...)."""
+    if start.ndim == 0:
+        return jax.lax.dynamic_slice_in_dim(line, start, n)
+    return jnp.take_along_axis(line, _raise(start, line.ndim) + _column(start, n, line.ndim), 0)
+
+
+def _raise(x: jax.Array, ndim: int) -> jax.Array:
+    """`x` with as many leading axes as `ndim` takes."""
+    return x.reshape((1,) * (ndim - x.ndim) + x.shape)
+
+
+def _column(like: jax.Array, n: int, ndim: int) -> jax.Array:
+    """0 to n - 1 along the first of `ndim` axes, of the type of `like`."""
+    return jnp.arange(n, dtype=like.dtype).reshape(n, *(1,) * (ndim - 1))
+
+
+def window(line: jax.Array, first: jax.Array, lag: jax.Array, n: int) -> jax.Array:
+    """The signal `lag` samples before each of the samples first, ..., first + n - 1, of which none is written yet.
+
+    Args:
+        line: samples (L, ...), written in blocks of n.
+        first: int scalar, a multiple of n.
+        lag: in samples, real, scalar or of the trailing axes; n <= lag <= L - n.
+        n: samples a block.
+
+    Returns:
+        (n, ...), linear between samples, zero before sample 0.
+    """
+    whole = jnp.floor(-lag)
+    start = first + whole.astype(first.dtype)
+    past = _rows(line, start % (line.shape[0] - n), n + 1)
+    number = _raise(start, line.ndim) + _column(start, n, line.ndim)
+    value = past[:-1] + (past[1:] - past[:-1]) * _raise(-lag - whole, line.ndim)
+    return jnp.where(number < 0, 0.0, value)
 
 
 def read(line: jax.Array, newest: jax.Array, lag: jax.Array) -> jax.Array:
@@ -63,3 +119,22 @@ def read_held(line: jax.Array, interval: jax.Array, lag: jax.Array, per_sample: 
 
     weight = whole - lag  # share of the interval that lies in the second one
     return (1.0 - weight) * held(first) + weight * held(second)
+
+
+def held_window(line: jax.Array, newest: jax.Array, lag: jax.Array, n: int) -> jax.Array:
+    """`read_held` for each of the n inner intervals of the newest sample's hold; (n, ...).
+
+    Args:
+        line: samples (L, ...), each held for n inner intervals.
+        newest: number of the newest sample, int scalar.
+        lag: in inner intervals, real, scalar or of the trailing axes, n <= lag <= (L - 2) n.
+        n: inner intervals a sample.
+    """
+    lag = lag / n
+    whole = jnp.ceil(lag)
+    first = newest - whole.astype(newest.dtype)
+    earlier, later = (
+        jnp.where(_raise(i, line.ndim) < 0, 0.0, _rows(line, i % line.shape[0], 1)) for i in (first, first + 1)
+    )
+    boundary = _column(lag, n, line.ndim) + 1.0 - n * _raise(1.0 - (whole - lag), line.ndim)
+    return earlier + (later - earlier) * jnp.clip(boundary, 0.0, 1.0)  # share of each interval in the later hold

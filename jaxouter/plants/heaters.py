@@ -1,23 +1,27 @@
 """Electric space heaters as a mean field (paper section IV).
 
-Units: temperatures in degC, time in h, Ca in kWh/degC, Ua in kW/degC. The houses are a vmapped axis; any parameter of a
-house may be one number for all or an array (n,).
+Units: temperatures in degC, time in h, Ca in kWh/degC, Ua in kW/degC. The houses are an axis of the state; any
+parameter of a house may be one number for all or an array (n,).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxouter.plants.base import Plant, array
 
 CONTROL_STEP = 1.0  # h
+FEW = 16  # houses; the draws of fewer are too short to fill vectors
 UFree = Literal["printed", "physical"]
+Law = Literal["euler-maruyama", "hourly", "lumped"]
 
 
 @struct.dataclass
@@ -40,18 +44,20 @@ class HouseParams:
 
 @struct.dataclass
 class HeatersParams:
-    """Parameters of the population; every array is traced, the number of houses is a shape."""
+    """Parameters of the population; every array is traced, the number of temperatures is a shape."""
 
     house: HouseParams
     x0_mean: jax.Array  # mean temperature at the start, degC; a number or (n,)
     x0_spread: jax.Array  # houses start at x0_mean plus or minus this, degC
-    weights: jax.Array  # (n,), y = sum of weights times temperatures
+    weights: jax.Array  # (n,), y = sum of weights times temperatures; (1,) when lumped
+    houses: jax.Array  # that one temperature stands for: 1, or all of them when lumped
+    law: Law = struct.field(pytree_node=False)  # how the noise of an hour is drawn
     u_free: UFree = struct.field(pytree_node=False)
     substeps: int = struct.field(pytree_node=False)  # Euler-Maruyama steps an hour
 
 
 class HeatersState(NamedTuple):
-    """State of the population."""
+    """State of the population; lumped, n is 1 and the one temperature is the mean of all houses."""
 
     x: jax.Array  # (n,), air temperatures, degC
     x0: jax.Array  # (n,), temperatures at the start of the episode, degC
@@ -61,6 +67,7 @@ class HeatersState(NamedTuple):
 def make(
     *,
     n: int = 4,
+    law: Law = "euler-maruyama",
     x0_mean: Any = 19.25,
     x0_spread: float = 1.0,
     Ca: Any = 10.0,
@@ -83,6 +90,11 @@ def make(
 
     Args:
         n: number of houses.
+        law: how the noise of an hour is drawn. From a given start, y has the same law after each hour in all three.
+            'euler-maruyama' draws every substep of every house: the scheme itself, a path for given increments.
+            'hourly' draws their sum over the hour at once, so `substeps` times fewer numbers: for many houses.
+            'lumped' knows only the mean of n identical houses, at a cost that does not depend on n: where only y is
+            looked at. `members` is then this mean as one member, and x0_spread has no effect.
         x0_mean, x0_spread: houses start at x0_mean + U(-1, 1) x0_spread, recentred to the exact mean, degC.
         Ca, Ua, x_out, sigma, Pi, r_u, phi, gamma, beta2, lambda1: house and local law, see `HouseParams`; each one
             number for all houses or an array (n,). Pi = 0.4 is the poor law of the paper, 17.186 the Riccati root.
@@ -93,24 +105,33 @@ def make(
         substeps: Euler-Maruyama steps an hour.
 
     Raises:
-        ValueError: a shape is wrong, n or substeps is not positive, or u_free does not fit.
+        ValueError: a shape is wrong, n or substeps is not positive, u_free does not fit, or houses to be lumped differ.
     """
     for name, value in (("n", n), ("substeps", substeps)):
         if int(value) != value or value < 1:
             raise ValueError(f"{name} is {value}; it must be a whole number of at least 1")
-    if u_free not in get_args(UFree):
-        raise ValueError(f"u_free is {u_free!r}; it must be one of {', '.join(get_args(UFree))}")
+    for name, value, allowed in (("u_free", u_free, get_args(UFree)), ("law", law, get_args(Law))):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(allowed)}")
     per_house = dict(
         Ca=Ca, Ua=Ua, x_out=x_out, sigma=sigma, Pi=Pi, r_u=r_u, phi=phi, gamma=gamma, beta2=beta2, lambda1=lambda1
     )
     per_house |= dict(gain=gain, disturbance=disturbance)
+    lumped = law == "lumped"
+    for name, value in (per_house | dict(x0_mean=x0_mean, weights=weights)).items():
+        if lumped and np.shape(value):
+            raise ValueError(
+                f"{name} has shape {np.shape(value)}; law 'lumped' is for identical houses: "
+                "give one number (weights: None), or take law 'hourly'"
+            )
     house = HouseParams(**{name: array(name, value, (), (n,)) for name, value in per_house.items()})
     for name, lowest in (("Ca", 1e-6), ("r_u", 1e-6), ("sigma", 0.0)):
         if float(jnp.min(getattr(house, name))) < lowest:
             raise ValueError(f"{name} is {per_house[name]}; it must {'be positive' if lowest else 'not be negative'}")
     if u_free == "physical" and float(jnp.min(house.Pi)) < 17.0:
         raise ValueError(f"u_free 'physical' goes with Pi = 17.186 only; Pi is {Pi} (then no r~ >= 0 reaches 15 degC)")
-    shares = jnp.full(n, 1.0 / n) if weights is None else array("weights", weights, (n,))
+    size = 1 if lumped else n
+    shares = jnp.full(size, 1.0 / size) if weights is None else array("weights", weights, (size,))
     if not float(jnp.sum(shares)) > 0.0:
         raise ValueError(f"weights are {weights}; their sum must be positive")
     params = HeatersParams(
@@ -118,6 +139,8 @@ def make(
         x0_mean=array("x0_mean", x0_mean, (), (n,)),
         x0_spread=array("x0_spread", x0_spread, ()),
         weights=shares,
+        houses=array("n", n / size, ()),
+        law=law,
         u_free=u_free,
         substeps=substeps,
     )
@@ -132,10 +155,17 @@ def init(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
 
 
 def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
-    """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it (spec section 5)."""
+    """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it (spec section 5).
+
+    Lumped, the mean of the n houses' deviations is drawn as a normal number of the same variance, within 1 degC.
+    """
     key_mean, key_house = jax.random.split(key)
-    mean = jax.random.uniform(key_mean, (), params.weights.dtype, 15.0, 25.0)
-    return _state(mean + jax.random.uniform(key_house, params.weights.shape, params.weights.dtype, -1.0, 1.0))
+    shape, dtype = params.weights.shape, params.weights.dtype
+    if params.law == "lumped":
+        offsets = jnp.clip(jax.random.normal(key_house, shape, dtype) / jnp.sqrt(3.0 * params.houses), -1.0, 1.0)
+    else:
+        offsets = jax.random.uniform(key_house, shape, dtype, -1.0, 1.0)
+    return _state(jax.random.uniform(key_mean, (), dtype, 15.0, 25.0) + offsets)
 
 
 def _state(x0: jax.Array) -> HeatersState:
@@ -148,42 +178,55 @@ def output(params: HeatersParams, state: HeatersState) -> jax.Array:
 
 
 def members(params: HeatersParams, state: HeatersState) -> jax.Array:
-    """Temperatures of the single houses (n,), degC."""
+    """Temperatures of the single houses (n,), degC; lumped, their mean (1,)."""
     del params
     return state.x
 
 
-def drift(p: HouseParams, x: jax.Array, x0: jax.Array, t: jax.Array, r_tilde: jax.Array, u_free: UFree) -> jax.Array:
-    """Deterministic part of dx/dt of one house under its local law, degC/h; all arguments scalar.
+def drift(
+    p: HouseParams, x: jax.Array, x0: jax.Array, decay: jax.Array, r_tilde: jax.Array, u_free: UFree
+) -> jax.Array:
+    """Deterministic part of dx/dt of the houses under their local law, degC/h; `decay` is exp(lambda1 t).
 
     Source: paper section IV, x* = r~ in both terms; spec section 3.
     """
-    chex.assert_rank([x, x0, t, r_tilde], 0)
     s_inf = r_tilde / (-p.Ua / p.Ca - p.Pi / (p.Ca**2 * p.r_u) - p.phi)
-    s = s_inf + p.gamma / (p.beta2 - p.lambda1) * (r_tilde - x0) * jnp.exp(p.lambda1 * t)
-    u = p.gain * -(p.Pi * x + s) / (p.Ca * p.r_u) + p.disturbance
-    hold = p.Ua * (x0 - p.x_out)  # power that holds x0
-    u_free_power = hold / p.Ca if u_free == "printed" else hold
-    return (-p.Ua * (x - p.x_out) + u + u_free_power) / p.Ca
+    s = s_inf + p.gamma / (p.beta2 - p.lambda1) * decay * (r_tilde - x0)
+    u = -p.gain / (p.Ca * p.r_u) * (p.Pi * x + s) + p.disturbance
+    held = p.Ua / p.Ca if u_free == "printed" else p.Ua  # of the power that holds x0, for each degC
+    return 1.0 / p.Ca * (-p.Ua * (x - p.x_out) + u + held * (x0 - p.x_out))
 
 
 def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: chex.PRNGKey) -> HeatersState:
-    """One hour with r~ (scalar, degC) held: Euler-Maruyama, one Wiener process a house."""
+    """One hour with r~ (scalar, degC) held: Euler-Maruyama, one Wiener process a house.
+
+    The scheme is x_(i+1) = a x_i + h b_i + sigma h^(1/2) w_i, and b_i is affine in exp(lambda1 t_i). So the m substeps
+    are one of the length h sum a^(m-1-i), at the mean of exp(lambda1 t_i) under these weights, and their noise.
+    """
     chex.assert_rank([state.x, r_tilde], [1, 0])
-    h = CONTROL_STEP / params.substeps
-    house_axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, params.house)
-    noise = jax.random.normal(key, (params.substeps, *state.x.shape), state.x.dtype)
+    p, m, n = params.house, params.substeps, state.x.size
+    h = CONTROL_STEP / m
+    a = 1.0 - h / p.Ca * (p.Ua + p.gain * p.Pi / (p.Ca * p.r_u))
+    ones, per_substep = [1.0] * m, jnp.exp(p.lambda1 * h)
+    steps = _left(a, ones)
+    decay = jnp.exp(p.lambda1 * (state.k.astype(state.x.dtype) * CONTROL_STEP))
+    decay = decay * _left(a, [per_substep**i for i in range(m)]) / steps
+    if params.law == "euler-maruyama":
+        # The numbers are the same in either shape; rows of many houses can be split over devices.
+        w = jax.random.normal(key, (m, n) if n >= FEW else (m * n,), state.x.dtype)
+        noise = _left(a, list(w.reshape(m, n)))
+    else:
+        noise = jnp.sqrt(_left(a**2, ones)) * jax.random.normal(key, (n,), state.x.dtype)
+    x = state.x + h * steps * drift(p, state.x, state.x0, decay, r_tilde, params.u_free)
+    return HeatersState(x + p.sigma * jnp.sqrt(h / params.houses) * noise, state.x0, state.k + 1)
 
-    def euler_maruyama(p, x, x0, t, w):
-        return x + h * drift(p, x, x0, t, r_tilde, params.u_free) + p.sigma * h**0.5 * w
 
-    def inner(x: jax.Array, i_and_w: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        i, w = i_and_w
-        t = state.k.astype(x.dtype) * CONTROL_STEP + i * h
-        return jax.vmap(euler_maruyama, (house_axes, 0, 0, None, 0))(params.house, x, state.x0, t, w), None
-
-    x, _ = jax.lax.scan(inner, state.x, (jnp.arange(params.substeps, dtype=state.x.dtype), noise))
-    return HeatersState(x, state.x0, state.k + 1)
+def _left(a: jax.Array, terms: Sequence[Any]) -> Any:
+    """What is left at the end of what came in each of m substeps: the sum of a^(m-1-i) terms_i."""
+    total = terms[0]
+    for term in terms[1:]:
+        total = a * total + term
+    return total
 
 
 def variables(params: HeatersParams, state: HeatersState) -> HeatersState:

@@ -54,15 +54,23 @@ class PitchParams:
     disturbance: jax.Array  # added to u, crad
     max_delay: float = struct.field(pytree_node=False)  # s; static: sets the length of the delay lines
     substeps: int = struct.field(pytree_node=False)  # inner steps a control step
+    late: tuple[bool, bool, bool] | None = struct.field(pytree_node=False)
+    """Which of theta, K1 x and K2 xc are late, that is delayed by more than a control step; the others are not delayed
+    at all. Then a control step is one matrix product. None: inner step by inner step, for any delays."""
 
 
 class PitchState(NamedTuple):
-    """State of the pitch plant; all zero at rest."""
+    """State of the pitch plant; all zero at rest.
+
+    Trailing axes may be added to all but `k`: plants side by side that began together.
+    """
 
     x: jax.Array  # (4,), [u ft/s, w ft/s, q crad/s, theta crad]
     xc: jax.Array  # integral of theta - c, crad s
     xi: jax.Array  # pilot
-    lines: jax.Array  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step
+    lines: (
+        jax.Array
+    )  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step; only of the late ones, if told
     r_tilde_line: jax.Array  # (M,), delay line of r~, a sample a control step
     k: jax.Array  # int32, control steps since the start
 
@@ -115,7 +123,10 @@ def make(
         Q, R: weights of the LQR design, (5,) diagonal and a number; unused where K1 and K2 are given.
         K1, K2: gains; None: the LQR gains of A, B, Q, R.
         gain, disturbance: multiplies u; added to u, crad.
-        max_delay: longest delay the lines can hold, s; None: the smallest that serves.
+        max_delay: longest delay the lines can hold, s. Where it is given, the plant serves every delay in
+            [0, max_delay] (a sweep), inner step by inner step. None: the largest of the three, and if it can be (tau is
+            more than a control step, d1 and d2 too or zero) whole control steps, which is many times faster and serves
+            all delays between.
         substeps: inner steps a control step of 0.1 s; at least 10, so that none is longer than 0.01 s.
 
     Raises:
@@ -125,13 +136,14 @@ def make(
     numbers = {name: array(name, value, ()) for name, value in scalars.items()}
     A, B, Q = array("A", A, (4, 4)), array("B", B, (4,)), array("Q", Q, (5,))
     delays = {name: float(numbers[name]) for name in ("tau", "d1", "d2")}
+    longest = max_delay
     if max_delay is None and all(map(math.isfinite, delays.values())):
-        max_delay = _enough(*delays.values())
-    if max_delay is not None and not 0.0 <= max_delay < math.inf:
-        raise ValueError(f"max_delay is {max_delay:g} s; it must be a number of at least 0")
+        longest = _enough(*delays.values())
+    if longest is not None and not 0.0 <= longest < math.inf:
+        raise ValueError(f"max_delay is {longest:g} s; it must be a number of at least 0")
     for name, value in delays.items():
-        if max_delay is None or not 0.0 <= value <= max_delay + 1e-6:
-            bound = "max_delay" if max_delay is None else f"{max_delay:g}"
+        if longest is None or not 0.0 <= value <= longest + 1e-6:
+            bound = "max_delay" if longest is None else f"{longest:g}"
             raise ValueError(f"{name} is {value:g} s; a delay must lie in [0, max_delay] = [0, {bound}] s")
     if substeps < 10:
         raise ValueError(f"substeps is {substeps}; it must be at least 10 (an inner step of at most 0.01 s)")
@@ -148,10 +160,22 @@ def make(
         B=B,
         K1=array("K1", K1, (4,)),
         K2=array("K2", K2, ()),
-        max_delay=max_delay or 0.0,
+        max_delay=longest or 0.0,
         substeps=substeps,
+        late=None if max_delay is not None else _late(substeps, **delays),
     )
     return PITCH, params
+
+
+def _late(substeps: int, tau: float, d1: float, d2: float) -> tuple[bool, bool, bool] | None:
+    """`PitchParams.late` of given delays, s."""
+    fits = tau > 0.0 and all(delay == 0.0 or delay >= _least_late(substeps) for delay in (tau, d1, d2))
+    return (True, d1 > 0.0, d2 > 0.0) if fits else None
+
+
+def _least_late(substeps: int) -> float:
+    """The least delay, s, with which nothing of a control step acts within it: half an inner step more than it."""
+    return CONTROL_STEP + CONTROL_STEP / substeps / 2 - 1e-6
 
 
 def _enough(*delays: float) -> float:
@@ -160,19 +184,24 @@ def _enough(*delays: float) -> float:
 
 
 def smallest(params: PitchParams) -> PitchParams:
-    """The same plant with the shortest delay lines that serve it."""
-    return dataclasses.replace(params, max_delay=_enough(float(params.tau), float(params.d1), float(params.d2)))
+    """The same plant with the shortest delay lines that serve it, in whole control steps if it can be."""
+    delays = dict(tau=float(params.tau), d1=float(params.d1), d2=float(params.d2))
+    return dataclasses.replace(params, max_delay=_enough(*delays.values()), late=_late(params.substeps, **delays))
 
 
 def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
     """Rest: everything zero."""
     del key
     zero = jnp.zeros(())
+    if params.late is None:
+        lines = (3, delay.length(params.max_delay, CONTROL_STEP / params.substeps))
+    else:
+        lines = (sum(params.late), delay.block_length(params.max_delay, CONTROL_STEP, params.substeps))
     return PitchState(
         x=jnp.zeros(4),
         xc=zero,
         xi=zero,
-        lines=jnp.zeros((3, delay.length(params.max_delay, CONTROL_STEP / params.substeps))),
+        lines=jnp.zeros(lines),
         r_tilde_line=jnp.zeros(delay.length(params.max_delay, CONTROL_STEP)),
         k=jnp.zeros((), jnp.int32),
     )
@@ -182,6 +211,11 @@ def start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
     """A training start: x uniform in plus or minus `START_SPREAD`, the rest as at rest."""
     spread = jnp.asarray(START_SPREAD)
     return init(key, params)._replace(x=jax.random.uniform(key, (4,), spread.dtype, -spread, spread))
+
+
+def reuse(old: PitchState, fresh: PitchState) -> PitchState:
+    """The fresh state with the old lines: before the start of an episode they count as zero, whatever they hold."""
+    return fresh._replace(lines=old.lines, r_tilde_line=old.r_tilde_line)
 
 
 def output(params: PitchParams, state: PitchState) -> jax.Array:
@@ -194,39 +228,92 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
     """One control step of 0.1 s with r~ (scalar, crad) held.
 
     The delay-free part is linear and propagated exactly; the delayed inputs are held over an inner step at their value
-    in its middle (r~: at its mean), which makes the whole second order. A delay outside [0, max_delay] gives NaN.
+    in its middle (r~: at its mean), which makes the whole second order. A delay that the parameters do not serve gives
+    NaN. Without vmap also for many plants that began together (see `PitchState`) with whole control steps: r~ and the
+    delays may then have their trailing axes.
 
     Source: paper section III; spec section 2.
     """
     del key
-    chex.assert_rank([state.x, r_tilde], [1, 0])
     p, h = params, CONTROL_STEP / params.substeps
-    transition = _discretise(p, h)
-    delays = jnp.stack([p.tau, p.d1, p.d2])
-    lags = delays / h
-    held = jnp.all((delays >= 0.0) & (delays <= p.max_delay + 1e-6))
+    lags = [value / h for value in (p.tau, p.d1, p.d2)]
+    z = jnp.concatenate([state.x, state.xc[None], state.xi[None]])
     r_tilde_line = delay.write(state.r_tilde_line, state.k, r_tilde)
+    advance = _inner_steps if p.late is None else _whole_step
+    z, lines = advance(p, z, state.lines, r_tilde_line, state.k, lags)
+    z = jnp.where(_served(p), z, jnp.nan)
+    return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.k + 1)
+
+
+def _served(p: PitchParams) -> jax.Array:
+    """Whether the plant is made for these delays."""
+    delays, late = (p.tau, p.d1, p.d2), p.late or (False, False, False)
+    least = _least_late(p.substeps)
+    bounds = [(least, p.max_delay) if is_late else (0.0, 0.0 if p.late else p.max_delay) for is_late in late]
+    fits = [(value >= low) & (value <= high + 1e-6) for value, (low, high) in zip(delays, bounds, strict=True)]
+    return fits[0] & fits[1] & fits[2]
+
+
+def _whole_step(
+    p: PitchParams, z: jax.Array, lines: jax.Array, r_tilde_line: jax.Array, k: jax.Array, lags: list[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """[x; xc; xi] and the lines after a control step in which all that is delayed is known at its start."""
+    assert p.late is not None
+    n, first = p.substeps, k * p.substeps
+    late = [i for i in range(3) if p.late[i]]
+    seen = {i: delay.window(lines[row], first, lags[i] - 0.5, n) for row, i in enumerate(late)}
+    theta_e = delay.held_window(r_tilde_line, k, lags[0], n) - seen[0]
+    bias = p.disturbance + p.W[0]
+    matrix = _propagator(p, late)
+    if late == [0]:  # u has no delayed part: what it gets is the same in all inner steps
+        matrix = jnp.concatenate([matrix[:, : 6 + n], bias * jnp.sum(matrix[:, 6 + n :], 1, keepdims=True)], 1)
+        inputs = [z, theta_e, jnp.ones_like(z[:1])]
+    else:
+        inputs = [z, theta_e, bias - p.gain * sum(seen[i] for i in late[1:])]
+    out = _dot(matrix, jnp.concatenate(inputs))
+    samples = out[6:].reshape(len(late), n, *z.shape[1:])
+    return out[:6], delay.write_block(lines, k, samples)
+
+
+def _propagator(p: PitchParams, late: list[int]) -> jax.Array:
+    """(6 + S n, 6 + 2 n): [x; xc; xi] after a control step and the n samples of the S late signals within it.
+
+    From [x; xc; xi] at its start, theta_e and the delayed part of u in its n inner steps.
+    """
+    n = p.substeps
+    one = _discretise(p, CONTROL_STEP / n, [i for i in (1, 2) if i not in late])
+    shown = jnp.zeros((3, 6)).at[0, 3].set(1.0).at[1, :4].set(p.K1).at[2, 4].set(p.K2)[jnp.array(late)]
+    z, samples = jnp.eye(6, 6 + 2 * n), []
+    for i in range(n):
+        samples.append(_dot(shown, z))
+        z = _dot(one[:, :6], z).at[:, 6 + i].add(one[:, 6]).at[:, 6 + n + i].add(one[:, 7])
+    return jnp.concatenate([z, jnp.stack(samples, 1).reshape(-1, 6 + 2 * n)])
+
+
+def _inner_steps(
+    p: PitchParams, z: jax.Array, lines: jax.Array, r_tilde_line: jax.Array, k: jax.Array, lags: list[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """[x; xc; xi] and the lines after a control step, with any delays."""
+    transition = _discretise(p, CONTROL_STEP / p.substeps, [])
 
     def inner(carry: tuple[jax.Array, jax.Array], i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
         z, lines = carry
-        n = state.k * p.substeps + i
+        n = k * p.substeps + i
         samples = jnp.stack([z[3], _dot(p.K1, z[:4]), p.K2 * z[4]])
         lines = jax.vmap(delay.write, (0, None, 0))(lines, n, samples)
-        theta, k1x, k2xc = jax.vmap(delay.read, (0, None, 0))(lines, n, lags - 0.5)
+        theta, k1x, k2xc = jax.vmap(delay.read, (0, None, 0))(lines, n, jnp.stack(lags) - 0.5)
         theta_e = delay.read_held(r_tilde_line, n, lags[0], p.substeps) - theta
         u = p.gain * -(k1x + k2xc) + p.disturbance + p.W[0]
         return (_dot(transition, jnp.concatenate([z, jnp.stack([theta_e, u])])), lines), None
 
-    z = jnp.concatenate([state.x, jnp.stack([state.xc, state.xi])])
-    (z, lines), _ = jax.lax.scan(inner, (z, state.lines), jnp.arange(p.substeps, dtype=state.k.dtype), unroll=5)
-    z = jnp.where(held, z, jnp.nan)
-    return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.k + 1)
+    return jax.lax.scan(inner, (z, lines), jnp.arange(p.substeps, dtype=k.dtype), unroll=5)[0]
 
 
 def variables(params: PitchParams, state: PitchState) -> PitchState:
     """The state without clock, its lines from the oldest to the newest sample."""
+    lines = state.lines if params.late is None else state.lines[:, : -params.substeps]  # without the mirror
     return state._replace(
-        lines=jnp.roll(state.lines, -state.k * params.substeps, axis=1),
+        lines=jnp.roll(lines, -state.k * params.substeps, axis=1),
         r_tilde_line=jnp.roll(state.r_tilde_line, -state.k),
         k=None,
     )
@@ -234,19 +321,26 @@ def variables(params: PitchParams, state: PitchState) -> PitchState:
 
 def settled(params: PitchParams, state: PitchState, variables: PitchState) -> PitchState:
     """These variables at a clock at which the next sample of every line belongs in row 0, late enough to fill them."""
-    del params
-    k = state.lines.shape[1] * state.r_tilde_line.shape[0]
-    return variables._replace(k=jnp.full_like(state.k, k))
+    lines = variables.lines
+    k = lines.shape[1] * state.r_tilde_line.shape[0]
+    if params.late is not None:
+        lines = jnp.concatenate([lines, lines[:, : params.substeps]], 1)
+    return variables._replace(lines=lines, k=jnp.full_like(state.k, k))
 
 
-def _discretise(p: PitchParams, h: float) -> jax.Array:
-    """(6, 8): [x; xc; xi] after an inner step of h, from [x; xc; xi; delayed theta_e; u + W1] at its start.
+def _discretise(p: PitchParams, h: float, undelayed: list[int]) -> jax.Array:
+    """(6, 8): [x; xc; xi] after an inner step of h, from [x; xc; xi; theta_e; u + W1] at its start.
 
-    The exponential is summed to order 6, exact in double precision for ||F h|| < 0.1.
+    The parts of u that are `undelayed` (1: K1 x, 2: K2 xc) act through the state, not through u. The exponential is
+    summed to order 6, exact in double precision for ||F h|| < 0.1.
     """
     F = jnp.zeros((8, 8))
     F = F.at[:4, :4].set(p.A + p.B[:, None] * jnp.stack([p.W[1], p.W[2], *jnp.zeros(2)])[None, :])
     F = F.at[:4, 7].set(p.B)
+    if 1 in undelayed:
+        F = F.at[:4, :4].add(-p.gain * p.B[:, None] * p.K1[None, :])
+    if 2 in undelayed:
+        F = F.at[:4, 4].set(-p.gain * p.B * p.K2)
     F = F.at[4, 3].set(1.0).at[4, 5].set(-p.C_h).at[4, 6].set(-p.D_h)
     F = F.at[5, 5].set(p.A_h).at[5, 6].set(p.B_h)
     exponential = jnp.eye(8)
@@ -265,6 +359,7 @@ PITCH = Plant(
     step=step,
     output=output,
     start=start,
+    reuse=reuse,
     variables=variables,
     settled=settled,
     smallest=smallest,

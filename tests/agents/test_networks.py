@@ -11,7 +11,10 @@ def test_layers_are_those_of_the_paper():
     actor = Actor((400, 300), 1).init(jax.random.key(0), obs)["params"]
     critic = Critic((400, 300), False).init(jax.random.key(0), obs, action)["params"]
     chex.assert_shape([actor[f"Dense_{i}"]["kernel"] for i in range(3)], [(33, 400), (400, 300), (300, 1)])
-    chex.assert_shape([critic[f"Dense_{i}"]["kernel"] for i in range(3)], [(33, 400), (401, 300), (300, 1)])
+    chex.assert_shape([critic[f"Dense_{i}"]["kernel"] for i in range(3)], [(33, 400), (400, 300), (300, 1)])
+    chex.assert_shape(critic["action"]["kernel"], (1, 300))  # the 401st row of the second layer
+    bounds = [float(jnp.abs(critic[name]["kernel"]).max()) for name in ("Dense_1", "action")]
+    np.testing.assert_allclose(bounds, 401**-0.5, rtol=0.05)
 
 
 def test_initial_weights_are_uniform_in_fan_in_and_small_at_the_end():
@@ -27,7 +30,7 @@ def test_first_critic_layer_does_not_see_the_action():
     obs, action = jnp.ones(3), jnp.ones(1)
     params = critic.init(jax.random.key(0), obs, action)
     blind = jax.tree.map(jnp.copy, params)
-    blind["params"]["Dense_1"]["kernel"] = blind["params"]["Dense_1"]["kernel"].at[-1].set(0.0)  # the action's row
+    blind["params"]["action"] = jax.tree.map(jnp.zeros_like, blind["params"]["action"])
     assert critic.apply(params, obs, action) != critic.apply(params, obs, -action)
     assert critic.apply(blind, obs, action) == critic.apply(blind, obs, -action)
 

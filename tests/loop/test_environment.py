@@ -351,6 +351,36 @@ def test_lanes_under_vmap_equal_single_environments_whatever_parameter_is_swept(
     np.testing.assert_array_equal(lanes[4], [False, False, True, True])
 
 
+@pytest.mark.parametrize("ages", [[0, 10, 49, 60], [0, 10, 20, 30]], ids=["some-end", "none-ends"])
+def test_resets_under_vmap_are_those_of_single_environments(ages: list[int]) -> None:
+    env, params = make()
+    keys, actions = jax.random.split(KEY, 4), jnp.array([1.0, -1.0, 3.0, 9.0])
+    states = [
+        reset(env, key, params)[1]._replace(k=jnp.asarray(k, jnp.int32)) for key, k in zip(keys, ages, strict=True)
+    ]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    lanes = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, stacked, actions, params)
+    for i, state in enumerate(states):
+        lane = jax.tree.map(lambda leaf, i=i: leaf[i], lanes)
+        alone = step(env, keys[i], state, actions[i], params)
+        chex.assert_trees_all_close(comparable(lane), comparable(alone), atol=1e-5)
+    np.testing.assert_array_equal(lanes[1].k == 0, np.array(ages) >= 49)
+
+
+def test_new_episode_of_pitch_does_not_see_the_old_one() -> None:
+    """The contents of its delay lines are kept at a reset, so that nothing is copied, but count as zero."""
+    env, params = jaxouter.make("pitch")
+    _, old = reset(env, KEY, params)
+    for action in (50.0, -50.0, 50.0):
+        _, old, *_ = step_env(env, KEY, old, scalar(action), params)
+    _, fresh = reset(env, KEY, params)
+    reused = fresh._replace(plant=env.plant.reuse(old.plant, fresh.plant))
+    assert float(jnp.abs(reused.plant.lines).max()) > 0.01
+    for _ in range(8):
+        fresh, reused = (step_env(env, KEY, state, scalar(20.0), params)[1] for state in (fresh, reused))
+        chex.assert_trees_all_equal((fresh.y, fresh.plant.x), (reused.y, reused.plant.x))
+
+
 def comparable(tree: Any) -> Any:
     """Keys as numbers."""
     is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)  # noqa: E731

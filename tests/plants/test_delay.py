@@ -159,3 +159,32 @@ def test_traced_delay_outside_its_range_gives_nan(name: str, value: float) -> No
     plant, params = make("pitch", max_delay=8.0)
     y = simulate(plant, params.replace(**{name: jnp.asarray(value, float)}), jnp.full(200, 16.0), KEY)
     assert bool(jnp.isnan(y).all())
+
+
+@pytest.mark.parametrize("count", [3, 30, 50, 80], ids=lambda n: f"{n}-samples")
+def test_window_of_a_line_written_in_blocks_is_what_single_reads_give(count: int) -> None:
+    """Around the ring too, and with lags that differ along a trailing axis."""
+    n, lags = 10, jnp.array([10.0, 10.3, 17.5, 29.99, 30.0])
+    rows = delay.block_length(3.0, 1.0, n)
+    samples = np.random.default_rng(0).normal(size=count // n * n)
+    lines = jnp.full((1, rows, len(lags)), jnp.nan)
+    for block, part in enumerate(samples.reshape(-1, n)):
+        lines = delay.write_block(lines, jnp.asarray(block), jnp.broadcast_to(part[None, :, None], (1, n, len(lags))))
+    window = delay.window(jnp.nan_to_num(lines[0], nan=9.0), jnp.asarray(len(samples)), lags, n)
+    full = filled(np.concatenate([samples, np.zeros(n)]), rows=count + 2 * n)
+    for i in range(n):
+        newest = jnp.asarray(len(samples) + i)
+        np.testing.assert_allclose(window[i], read_lanes(full, newest, lags), atol=1e-5)
+    for j, lag in enumerate(lags):
+        np.testing.assert_allclose(delay.window(lines[0, :, j], newest - n + 1, lag, n), window[:, j], atol=1e-6)
+
+
+@pytest.mark.parametrize("newest", [0, 3, 9, 20])
+def test_held_window_is_what_single_reads_give(newest: int) -> None:
+    n, lags = 10, jnp.array([10.0, 10.5, 23.7, 60.0])
+    samples = np.random.default_rng(1).normal(size=newest + 1)
+    line = jnp.nan_to_num(filled(samples), nan=9.0)
+    window = delay.held_window(jnp.broadcast_to(line[:, None], (ROWS, 4)), jnp.asarray(newest), lags, n)
+    for i in range(n):
+        single = read_held_lanes(line, jnp.asarray(newest * n + i), lags, n)
+        np.testing.assert_allclose(window[i], single, atol=1e-5)

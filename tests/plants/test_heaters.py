@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import chex
 import jax
@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxouter
 from jaxouter.plants import heaters, make, simulate
-from jaxouter.plants.heaters import HEATERS, HeatersParams, HeatersState
+from jaxouter.plants.heaters import HEATERS, HeatersParams, HeatersState, Law
 
 KEY = jax.random.key(0)
 SETPOINTS = np.repeat([15.0, 20.0, 17.0, 22.0], 50)  # degC
 PRINTED = dict(Ca=10.0, Ua=0.2, x_out=-5.0, Pi=0.4, r_u=10.0, phi=0.001, gamma=0.6, beta2=0.038, lambda1=-0.028)
 N, R_TILDE = 100_000, np.array([18.0, 18.0, 25.0])
+LAWS = get_args(Law)
 STIFF = dict(Ca=1.0, Ua=0.8, Pi=0.5, r_u=2.0, sigma=0.7)  # time constant of an hour, so that the step shows
 
 
@@ -47,6 +49,7 @@ def hours(params: HeatersParams, state: HeatersState, r_tilde: np.ndarray, key: 
 
 
 run_hours = jax.jit(hours)
+runs_hours = jax.jit(jax.vmap(hours, (None, None, None, 0)))
 inits = jax.jit(jax.vmap(HEATERS.init, (0, None)))
 
 
@@ -79,15 +82,16 @@ def test_riccati_root_and_its_constants_are_those_of_the_specification() -> None
 
 def recursion(p: dict[str, float], x0: float, r_tilde: np.ndarray, substeps: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance of a house after each hour: x_(n+1) = a x_n + b_n + s w, from the equations as printed."""
-    h = 1.0 / substeps
-    a = 1.0 - h / p["Ca"] * (p["Ua"] + p["Pi"] / (p["Ca"] * p["r_u"]))
+    h, p = 1.0 / substeps, {"gain": 1.0, "disturbance": 0.0} | p
+    a = 1.0 - h / p["Ca"] * (p["Ua"] + p["gain"] * p["Pi"] / (p["Ca"] * p["r_u"]))
     u_free = -p["Ua"] / p["Ca"] * (p["x_out"] - x0)
     mean, variance, means, variances = x0, 0.0, [], []
     for n in range(len(r_tilde) * substeps):
         r = r_tilde[n // substeps]
         s_inf = r / (-p["Ua"] / p["Ca"] - p["Pi"] / (p["Ca"] ** 2 * p["r_u"]) - p["phi"])
         s = s_inf + p["gamma"] / (p["beta2"] - p["lambda1"]) * (r - x0) * math.exp(p["lambda1"] * n * h)
-        mean = a * mean + h / p["Ca"] * (p["Ua"] * p["x_out"] - s / (p["Ca"] * p["r_u"]) + u_free)
+        u = -p["gain"] * s / (p["Ca"] * p["r_u"]) + p["disturbance"]  # without its part in x
+        mean = a * mean + h / p["Ca"] * (p["Ua"] * p["x_out"] + u + u_free)
         variance = a**2 * variance + p["sigma"] ** 2 * h
         if (n + 1) % substeps == 0:
             means.append(mean)
@@ -95,17 +99,24 @@ def recursion(p: dict[str, float], x0: float, r_tilde: np.ndarray, substeps: int
     return np.array(means), np.array(variances)
 
 
-def test_noise_free_run_is_the_recursion() -> None:
-    expected, _ = recursion(PRINTED | {"sigma": 0.0}, 19.25, SETPOINTS, 10)
-    y = simulate(*make("heaters", sigma=0.0), SETPOINTS, KEY)
-    np.testing.assert_allclose(y, expected, atol=2e-3)
+@pytest.mark.parametrize("law", LAWS)
+def test_noise_free_run_is_the_recursion(law: Law) -> None:
+    changes = dict(sigma=0.0, gain=1.2, disturbance=0.3)
+    expected, _ = recursion(PRINTED | changes, 19.25, SETPOINTS, 10)
+    y = simulate(*make("heaters", law=law, **changes), SETPOINTS, KEY)
+    np.testing.assert_allclose(y, expected, atol=1e-4)
 
 
-@pytest.fixture(scope="module")
-def many() -> np.ndarray:
-    """Temperatures of many stiff houses after each hour, (3, N)."""
-    params = nominal(n=N, **STIFF)
-    return np.asarray(run_hours(params, given(params, 19.0), R_TILDE).x, float)
+@pytest.fixture(scope="module", params=LAWS)
+def many(request: pytest.FixtureRequest) -> np.ndarray:
+    """Temperatures of many stiff houses after each hour, (3, N); lumped, the mean of 16 with 4 times its noise."""
+    if request.param != "lumped":
+        params = nominal(n=N, law=request.param, **STIFF)
+        return np.asarray(run_hours(params, given(params, 19.0), R_TILDE).x, float)
+    params = nominal(n=16, law="lumped", **STIFF)
+    x = runs_hours(params, given(params, 19.0), R_TILDE, jax.random.split(KEY, N)).x[..., 0].T
+    noise_free = recursion(PRINTED | STIFF, 19.0, R_TILDE, 10)[0][:, None]
+    return noise_free + 4.0 * (np.asarray(x, float) - noise_free)
 
 
 def test_moments_of_the_houses_are_those_of_the_recursion(many: np.ndarray) -> None:
@@ -114,6 +125,18 @@ def test_moments_of_the_houses_are_those_of_the_recursion(many: np.ndarray) -> N
     assert (np.abs(many.var(1) / variance - 1) < 5 * np.sqrt(2 / N)).all()
     continuous = 0.7**2 / (2 * 1.05)  # to which the recursion's variance has an error of 5 % here
     assert abs(variance[-1] / continuous - 1) > 10 * np.sqrt(2 / N)
+
+
+@pytest.mark.parametrize("law", ["euler-maruyama", "hourly"])
+def test_moments_of_houses_that_differ_are_their_own(law: Law) -> None:
+    stock = dict(Ca=[1.0, 2.0], Ua=[0.8, 3.0], sigma=[0.7, 0.2], gain=[1.0, 2.0])
+    params, seeds = nominal(n=2, law=law, **STIFF | stock), 20_000
+    x = np.asarray(runs_hours(params, given(params, 19.0), R_TILDE, jax.random.split(KEY, seeds)).x, float)
+    for house in range(2):
+        p = PRINTED | STIFF | {name: values[house] for name, values in stock.items()}
+        mean, variance = recursion(p, 19.0, R_TILDE, 10)
+        assert (np.abs(x[..., house].mean(0) - mean) < 5 * np.sqrt(variance / seeds)).all()
+        assert (np.abs(x[..., house].var(0) / variance - 1) < 5 * np.sqrt(2 / seeds)).all()
 
 
 def test_noise_of_one_hour_is_independent_of_the_next(many: np.ndarray) -> None:
@@ -168,7 +191,8 @@ def test_paths_converge_with_the_first_power_of_the_step(monkeypatch: pytest.Mon
 
     def path(substeps: int) -> np.ndarray:
         params = nominal(n=n, substeps=substeps, **STIFF)
-        return np.asarray(HEATERS.step(params, given(params, 19.0), scalar(18.0), KEY).x, float)
+        step = jax.jit(lambda *at: HEATERS.step(params, *at))  # a new function, so that no other draw is in its cache
+        return np.asarray(step(given(params, 19.0), scalar(18.0), KEY).x, float)
 
     coarse, middle, fine = (path(substeps) for substeps in (10, 20, 40))
     assert np.std(coarse - middle) > 1e-4
@@ -180,6 +204,8 @@ MIXED = dict(
     Ua=[0.15, 0.2, 0.26, 0.3],
     Pi=[0.4, 17.186, 5.0, 0.4],
     x_out=[-5.0, -10.0, 0.0, -5.0],
+    gain=[1.0, 0.9, 1.1, 1.0],
+    lambda1=[-0.028, -0.02, -0.05, -0.028],
 )
 MIXED_X0 = np.array([18.0, 19.0, 21.0, 16.0])
 
@@ -194,10 +220,11 @@ def test_houses_of_mixed_parameters_equal_houses_alone() -> None:
     assert float(jnp.ptp(x[-1])) > 1.0
 
 
-def test_permuting_the_houses_permutes_their_temperatures() -> None:
+@pytest.mark.parametrize("law", ["euler-maruyama", "hourly"])
+def test_permuting_the_houses_permutes_their_temperatures(law: Law) -> None:
     order = np.array([2, 0, 3, 1])
-    params = nominal(sigma=0.0, **MIXED)
-    permuted = nominal(sigma=0.0, **{name: np.array(values)[order] for name, values in MIXED.items()})
+    params = nominal(law=law, sigma=0.0, **MIXED)
+    permuted = nominal(law=law, sigma=0.0, **{name: np.array(values)[order] for name, values in MIXED.items()})
     x = run_hours(params, given(params, MIXED_X0), SETPOINTS).x
     expected = run_hours(permuted, given(permuted, MIXED_X0[order]), SETPOINTS).x
     chex.assert_trees_all_close(x[:, order], expected, atol=1e-5)
@@ -258,19 +285,19 @@ def test_training_starts_have_a_drawn_mean_and_houses_within_1_degree_of_it() ->
 def test_free_power_without_control(u_free: str, rate: float) -> None:
     """Printed, it is a tenth of the loss at x0; physical, it holds x0."""
     params = nominal(u_free=u_free, Pi=17.186, gain=0.0)
-    drift = heaters.drift(params.house, scalar(15.0), scalar(15.0), scalar(0.0), scalar(20.0), params.u_free)
+    drift = heaters.drift(params.house, scalar(15.0), scalar(15.0), scalar(1.0), scalar(20.0), params.u_free)
     assert float(drift) == pytest.approx(rate, abs=1e-6)
 
 
 def test_disturbance_is_power_added_to_the_control() -> None:
     off, on = nominal(gain=0.0), nominal(gain=0.0, disturbance=3.0)
-    at = (scalar(15.0), scalar(15.0), scalar(0.0), scalar(20.0))
+    at = (scalar(15.0), scalar(15.0), scalar(1.0), scalar(20.0))
     added = heaters.drift(on.house, *at, "printed") - heaters.drift(off.house, *at, "printed")
     assert float(added) == pytest.approx(3.0 / 10.0, rel=1e-5)
 
 
 def test_gain_multiplies_the_control() -> None:
-    at = (scalar(15.0), scalar(16.0), scalar(3.0), scalar(20.0))
+    at = (scalar(15.0), scalar(16.0), scalar(math.exp(-0.028 * 3.0)), scalar(20.0))
     none, once, twice = (float(heaters.drift(nominal(gain=g).house, *at, "printed")) for g in (0.0, 1.0, 2.0))
     assert twice - none == pytest.approx(2 * (once - none), rel=1e-4)
     assert once - none == pytest.approx(-(0.4 * 15.0 + _offset(16.0, 20.0, 3.0)) / 100.0 / 10.0, rel=1e-4)
@@ -317,3 +344,63 @@ def test_output_is_differentiable_in_the_modified_reference() -> None:
     (low, slope), (high, _) = y(scalar(10.0)), y(scalar(30.0))
     assert float(slope) == pytest.approx(float(high - low) / 20.0, rel=1e-3)  # exact: affine in r~
     assert float(slope) > 1e-3
+
+
+def test_noise_of_the_substeps_is_summed_in_the_pass_that_makes_it() -> None:
+    """No array of normal numbers, (substeps, n), is written."""
+    params = nominal(n=1000)
+    compiled = jax.jit(HEATERS.step).lower(params, given(params, 19.0), scalar(20.0), KEY).compile().as_text()
+    written = str(compiled).partition("ENTRY")[2]
+    assert "u32[10,1000]" in written  # random bits are
+    assert "f32[10,1000]" not in written
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_settled_state_has_the_variables_and_steps_without_a_clock(law: Law) -> None:
+    params = nominal(law=law, lambda1=-100.0)
+    state = jax.tree.map(lambda leaf: leaf[-1], run_hours(params, given(params, 19.0), R_TILDE))
+    settled = HEATERS.settled(params, state, HEATERS.variables(params, state))
+    chex.assert_trees_all_equal_shapes_and_dtypes(settled, state)
+    after, expected = (run_hours(params, each, R_TILDE).x for each in (settled, state))
+    chex.assert_trees_all_close(after, expected, atol=1e-5)
+
+
+def test_lumped_houses_are_as_cheap_as_one_however_many() -> None:
+    env, params = jaxouter.make("heaters", n=10**9, law="lumped", x0_mean=17.8)
+    assert float(HEATERS.output(params.plant, HEATERS.init(KEY, params.plant))) == pytest.approx(17.8, rel=1e-7)
+    before = jax.jit(env.reset)(KEY, params)[1]
+    after, reward = jax.jit(env.step)(KEY, before, scalar(20.0), params)[1:3]
+    assert HEATERS.members is not None
+    chex.assert_trees_all_equal(HEATERS.members(params.plant, after.plant), after.y[None])
+    assert sum(leaf.size for leaf in jax.tree.leaves(after.plant)) == 3
+    assert float(reward) == pytest.approx(-0.3 * abs(float(before.r - after.y)), abs=0.2)
+    assert float(after.y) != float(before.y)
+
+
+def test_lumped_training_starts_spread_like_the_mean_of_the_houses() -> None:
+    keys, params = jax.random.split(KEY, 20_000), nominal(law="lumped")
+    y = jax.jit(jax.vmap(lambda key, houses: start_y(key, replace(params, houses=houses)), (0, None)))
+    mean = np.asarray(y(keys, scalar(1e12)))
+    assert 15.0 <= mean.min() < 15.1
+    assert 24.9 < mean.max() <= 25.0
+    of_four = np.asarray(y(keys, scalar(4.0))) - mean
+    assert of_four.var() == pytest.approx(1 / 12, rel=5 * math.sqrt(2 / 20_000))
+    assert np.abs(np.asarray(y(keys, scalar(1.0))) - mean).max() == pytest.approx(1.0, abs=1e-5)
+
+
+def start_y(key: jax.Array, params: HeatersParams) -> jax.Array:
+    return HEATERS.output(params, HEATERS.training_start(key, params))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"law": "exact"}, "law is 'exact'; it must be one of euler-maruyama, hourly, lumped"),
+        ({"law": "lumped", "Ua": [0.2] * 4}, r"Ua has shape \(4,\); law 'lumped' is for identical houses.*'hourly'"),
+        ({"law": "lumped", "x0_mean": [19.0]}, r"x0_mean has shape \(1,\); law 'lumped'"),
+        ({"law": "lumped", "weights": [0.25] * 4}, r"weights has shape \(4,\).*weights: None"),
+    ],
+)
+def test_laws_that_do_not_fit_are_refused(overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        nominal(**overrides)

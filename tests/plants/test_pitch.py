@@ -28,6 +28,14 @@ def run(r_tilde: float | np.ndarray, state: PitchState | None = None, **override
     return np.asarray(y, float)
 
 
+def run_whole(r_tilde: float | np.ndarray, x0: list[float] | None = None, **overrides: Any) -> np.ndarray:
+    """The same in whole control steps."""
+    params = make("pitch", **overrides)[1]
+    assert params.late is not None
+    state = PITCH.init(KEY, params)._replace(x=jnp.asarray(x0 or [0.0] * 4, float))
+    return np.asarray(simulate(PITCH, params, np.broadcast_to(r_tilde, STEPS), KEY, state), float)
+
+
 REST = PITCH.init(KEY, nominal())
 
 
@@ -182,6 +190,55 @@ def test_agrees_with_an_independent_simulation(name: str, independent: dict[str,
     y = run(r_tilde, state, tau=tau, d1=d1, d2=d2)
     assert np.abs(independent[name]).max() > 4.0
     np.testing.assert_allclose(y, independent[name], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["nominal", "late-controller", "moving-start"])
+def test_whole_control_steps_agree_with_an_independent_simulation(
+    name: str, independent: dict[str, np.ndarray]
+) -> None:
+    tau, d1, d2, x0, r_tilde = cases()[name]
+    np.testing.assert_allclose(run_whole(r_tilde, x0, tau=tau, d1=d1, d2=d2), independent[name], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"tau": 0.105},
+        {"tau": 0.537, "d1": 0.123},
+        {"d2": 0.333, "gain": 1.3, "disturbance": 2.0},
+        {"d1": 5.7, "d2": 0.57},
+    ],
+    ids=str,
+)
+def test_whole_control_steps_agree_with_inner_steps(overrides: dict[str, float]) -> None:
+    r_tilde = np.random.default_rng(0).uniform(0.0, 32.0, STEPS)
+    whole, inner = run_whole(r_tilde, **overrides), run(r_tilde, **overrides)
+    np.testing.assert_allclose(whole, inner, rtol=0, atol=2e-5 * np.abs(inner).max())
+
+
+def test_plants_side_by_side_equal_lanes_under_vmap() -> None:
+    params = make("pitch")[1]
+    taus = jnp.array([0.105, 0.27, 0.5])
+    r_tilde = jax.random.uniform(KEY, (STEPS, 3), float, -30.0, 30.0)
+    states = jax.vmap(PITCH.training_start, (0, None))(jax.random.split(KEY, 3), params)
+    several = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), states)._replace(k=states.k[0])
+
+    @jax.jit
+    def together(state: PitchState, r_tilde: jax.Array) -> jax.Array:
+        def step(state: PitchState, r_tilde: jax.Array) -> tuple[PitchState, jax.Array]:
+            state = PITCH.step(params.replace(tau=taus), state, r_tilde, KEY)
+            return state, state.x[3]
+
+        return jax.lax.scan(step, state, r_tilde)[1]
+
+    lanes = jax.vmap(lambda tau, state, r: simulate(PITCH, params.replace(tau=tau), r, KEY, state), (0, 0, 1), 1)
+    chex.assert_trees_all_close(together(several, r_tilde), lanes(taus, states, r_tilde), atol=1e-4)
+
+
+@pytest.mark.parametrize("delays", [{"tau": 0.09}, {"tau": 0.61}, {"d1": 0.2}, {"d2": 0.0}], ids=str)
+def test_delay_that_whole_control_steps_do_not_serve_gives_nan(delays: dict[str, float]) -> None:
+    params = make("pitch", d2=0.57)[1].replace(**{name: jnp.asarray(value) for name, value in delays.items()})
+    assert bool(jnp.isnan(simulate(PITCH, params, jnp.full(STEPS, 16.0), KEY)).all())
 
 
 def refined(tau: float, d1: float, d2: float) -> tuple[np.ndarray, ...]:
