@@ -19,9 +19,11 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.training import devices
 from jaxouter.training.config import TrainConfig, preset
+from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.run import FORMAT, Run, write_json
-from jaxouter.training.train import begin, train
+from jaxouter.training.train import train
 from jaxouter.training.trainer import Trainer, TrainState
 
 
@@ -37,7 +39,15 @@ class Options:
     out: Path | None = None
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Go on with the run in this folder; takes no other option."""
+    """Go on with the run in this folder; takes no other option but --devices (draws go on otherwise where a learner
+    then spans another number of them) and how to find the other processes."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
+    several SLURM tasks or an indexed Kubernetes job (with `jax[k8s]`) JAX finds this and the next two by itself."""
+    num_processes: int | None = None
+    """Processes in all, each started with the same options but its own --process-id."""
+    process_id: int | None = None
+    """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
@@ -49,8 +59,19 @@ def parse(arguments: list[str]) -> Options:
     plain = [argument for argument in arguments if argument not in ("-h", "--help")]
     config = tyro.cli(Options, prog=program, args=plain, default=first).config
     options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(config.plant, config.preset)))
-    if options.resume is not None and options != dataclasses.replace(first, resume=options.resume):
-        raise ValueError("--resume takes no other option: the run folder holds them all")
+    if options.resume is not None:
+        execution = {name: getattr(options, name) for name in ("resume", *Processes.__dataclass_fields__)}
+        config = dataclasses.replace(first.config, devices=options.config.devices)
+        if options != dataclasses.replace(first, config=config, **execution):
+            raise ValueError(
+                "--resume takes no other option but --devices, --coordinator, --num-processes and --process-id: "
+                "the run folder holds them all"
+            )
+        run = Run.open(options.resume).config
+        given = any(argument.split("=")[0] == "--devices" for argument in arguments)
+        options = dataclasses.replace(
+            options, config=dataclasses.replace(run, devices=options.config.devices if given else run.devices)
+        )
     return options
 
 
@@ -62,12 +83,17 @@ def main(arguments: list[str] | None = None) -> None:
         if options.list:
             return cli.print_lists()
         cli.use_compilation_cache()
-        run = Run.open(options.resume) if options.resume else Run(Path(), options.config)
-        trainer, _ = run.trainer  # checks the configuration
-        run = run if options.resume else Run.create(options.config, options.out)
-        print(f"{run.config.plant}, preset {run.config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
+        config = options.config.check()
+        processes = Processes(options.coordinator, options.num_processes, options.process_id)
+        devices.connect(config.devices, processes.check(config.devices))
+        Fleet.of(config)  # what is left of the checks, before anything is written
+        path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
+        run = Run(Path(path), config)
+        first, trainer = devices.is_first(), run.trainer[0]
+        if first:
+            seeds = ", ".join(map(str, run.seeds))
+            print(f"{config.plant}, preset {config.preset}, seeds {seeds} -> {run.path}")
         with cli.Interrupt() as interrupt:
-            states = begin(run)
             watched = scenarios.get(scenarios.paper_scenarios(run.config.plant)[0])
 
             def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
@@ -75,12 +101,15 @@ def main(arguments: list[str] | None = None) -> None:
                 traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
                 return {"mae": mae(traces)}
 
-            with cli.TrainingProgress(run.config, trainer.env.plant.y_unit) as progress:
-                finals = train(run, states, watch, progress, lambda: interrupt.requested)
+            with cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
+                finals = train(run, watch, progress, lambda: interrupt.requested)
+        devices.part()
     if finals is None:
-        print(f"saved; go on with: python -m jaxouter.train --resume {run.path}", file=sys.stderr)
+        if first:
+            print(f"saved; go on with: python -m jaxouter.train --resume {run.path}", file=sys.stderr)
         raise SystemExit(130)
-    report(run, finals, begun)
+    if first:
+        report(run, finals, begun)
 
 
 def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
@@ -97,7 +126,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)),
+        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
+        / run.config.side_by_side,
         "steps": run.config.steps,
         "updates": run.config.total_updates,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]

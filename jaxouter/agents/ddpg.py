@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxouter.agents.adam import adam
 from jaxouter.agents.networks import Actor, Critic
 
 
@@ -128,9 +129,9 @@ def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.
 
 def descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
     """Parameters and optimiser state after one step."""
-    with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
+    with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
         step, state = optimiser.update(gradient, state, params)
-        return optax.apply_updates(params, step), state
+    return optax.apply_updates(params, step), state
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,8 @@ class DDPG:
     action_size: int = 1
     total_updates: int = 1
     """Updates of the whole training, for the decay of the learning rates."""
+    axis: str | None = None
+    """Mapped axis over which gradients are averaged: each of its members updates on its part of the batch."""
 
     @property
     def actor(self) -> Actor:
@@ -153,6 +156,9 @@ class DDPG:
         """The critic network."""
         return Critic(self.config.hidden, self.config.layer_norm)
 
+    def _average(self, gradient: Any) -> Any:
+        return gradient if self.axis is None else jax.lax.pmean(gradient, self.axis)
+
     def _rate(self, rate: float) -> float | optax.Schedule:
         decays = self.config.rate_decay == "cosine"
         return optax.cosine_decay_schedule(rate, max(1, self.total_updates)) if decays else rate
@@ -160,19 +166,19 @@ class DDPG:
     @property
     def actor_optimiser(self) -> optax.GradientTransformation:
         """Adam."""
-        return optax.adam(self._rate(self.config.actor_rate))
+        return adam(self._rate(self.config.actor_rate))
 
     @property
     def critic_optimiser(self) -> optax.GradientTransformation:
         """Adam on the gradient of loss plus L2 penalty; biases are not penalised."""
-        adam = optax.adam(self._rate(self.config.critic_rate))
+        plain = adam(self._rate(self.config.critic_rate))
         if self.config.critic_l2 == 0:
-            return adam
+            return plain
 
         def kernels(params: Any) -> Any:
             return jax.tree.map(lambda leaf: leaf.ndim > 1, params)
 
-        return optax.chain(optax.add_decayed_weights(self.config.critic_l2, kernels), adam)
+        return optax.chain(optax.add_decayed_weights(self.config.critic_l2, kernels), plain)
 
     def init(self, key: chex.PRNGKey) -> LearnerState:
         """Random networks, targets equal to them."""
@@ -228,7 +234,9 @@ class DDPG:
             return jnp.mean(jnp.sum((target[:, None] - q) ** 2, -1)), jnp.mean(q)
 
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
-        critics, critic_optimiser = descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
+        critics, critic_optimiser = descend(
+            self.critic_optimiser, self._average(gradient), state.critic_optimiser, state.critics
+        )
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
         def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array]]:
@@ -240,7 +248,9 @@ class DDPG:
                 return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
 
             (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
-            actor, optimiser = descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
+            actor, optimiser = descend(
+                self.actor_optimiser, self._average(gradient), state.actor_optimiser, state.actor
+            )
             state = state._replace(
                 actor=actor,
                 actor_optimiser=optimiser,

@@ -24,6 +24,9 @@ class TrainConfig:
     """Seed of the first run."""
     seeds: int = 1
     """Runs with consecutive seeds, trained side by side."""
+    devices: int = 1
+    """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
+    spans several, which share its environments, replay and batch, and then draw otherwise than one."""
     steps: int = 200_000
     """Environment steps in all, over all environments, prefill included."""
     environments: int = 1
@@ -63,7 +66,7 @@ class TrainConfig:
         """
         plants.resolve(self.plant)
         self.ddpg.check()
-        for name in ("seeds", "steps", "environments", "updates", "epoch", "reward_scale"):
+        for name in ("seeds", "devices", "steps", "environments", "updates", "epoch", "reward_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if self.seed < 0:
@@ -72,6 +75,16 @@ class TrainConfig:
             if getattr(self, name) % self.environments:
                 raise ValueError(
                     f"{name} is {getattr(self, name)}; it must be a multiple of the {self.environments} environments"
+                )
+        if max(self.seeds, self.devices) % min(self.seeds, self.devices):
+            raise ValueError(
+                f"devices is {self.devices} and seeds is {self.seeds}; one must be a multiple of the other"
+            )
+        for name, value in (("environments", self.environments), ("ddpg.batch_size", self.ddpg.batch_size)):
+            if value % self.shards:
+                raise ValueError(
+                    f"{name} is {value}; it must be a multiple of the {self.shards} devices that each of the "
+                    f"{self.seeds} seeds gets of {self.devices}"
                 )
         if not self.ddpg.batch_size <= self.prefill < self.steps:
             raise ValueError(
@@ -92,6 +105,16 @@ class TrainConfig:
                 "they must be positive and not negative"
             )
         return self
+
+    @property
+    def side_by_side(self) -> int:
+        """Seeds that train at the same time."""
+        return min(self.seeds, self.devices)
+
+    @property
+    def shards(self) -> int:
+        """Devices that one learner spans."""
+        return self.devices // self.side_by_side
 
     @property
     def epochs(self) -> int:
@@ -179,4 +202,5 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
             raise ValueError(f"the configuration has fields {sorted(set(values) ^ names)} missing or unknown")
         return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
 
-    return build(TrainConfig, {**values, "ddpg": build(DDPGConfig, values.get("ddpg", {}))})
+    # Runs of versions that knew one device only go on as they were.
+    return build(TrainConfig, {"devices": 1, **values, "ddpg": build(DDPGConfig, values.get("ddpg", {}))})

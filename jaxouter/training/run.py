@@ -17,6 +17,7 @@ import jaxouter
 from jaxouter.loop.environment import EnvParams
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
+from jaxouter.training.devices import Fleet
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 FORMAT = 1
@@ -92,19 +93,38 @@ class Run:
         """The trainer of the configuration and the parameters of its environments."""
         return build(self.config)
 
-    def checkpoints(self, seed: int) -> list[Path]:
-        """Checkpoints of a seed, oldest first."""
-        return sorted(self.seed_folder(seed).glob("checkpoint-*.npz"))
+    @cached_property
+    def fleet(self) -> Fleet:
+        """The trainer over the devices of the configuration."""
+        return Fleet.of(self.config)
+
+    def checkpoints(self, seed: int) -> dict[int, Path]:
+        """Checkpoints of a seed by the number of epochs, oldest first."""
+        paths = sorted(self.seed_folder(seed).glob("checkpoint-*.npz"))
+        return {int(path.stem.removeprefix("checkpoint-")): path for path in paths}
+
+    def common_epoch(self) -> int:
+        """The newest epoch of which every seed has a checkpoint, where all go on together; 0 at the beginning.
+
+        Raises:
+            ValueError: there is none, although some seed is further than the first epoch.
+        """
+        kept = {seed: set(self.checkpoints(seed)) for seed in self.seeds}
+        common = set.intersection(*kept.values())
+        if not common and any(max(epochs, default=0) > 1 for epochs in kept.values()):
+            found = "; ".join(f"seed {seed}: {sorted(epochs) or 'none'}" for seed, epochs in kept.items())
+            raise ValueError(f"{self.path}: the seeds have no checkpoint of the same epoch ({found})")
+        return max(common, default=0)
 
     def save(self, seed: int, epoch: int, state: TrainState) -> None:
         """Checkpoint after so many epochs; old ones are removed."""
         path = self.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz"
         checkpoint.save(path, state, seed=seed, epoch=epoch)
-        for old in self.checkpoints(seed)[:-KEEP]:
+        for old in list(self.checkpoints(seed).values())[:-KEEP]:
             old.unlink()
 
-    def load(self, seed: int) -> tuple[TrainState, int]:
-        """State and number of epochs of the newest checkpoint.
+    def load(self, seed: int, epoch: int | None = None) -> tuple[TrainState, int]:
+        """State and number of epochs of the checkpoint after so many epochs; None: the newest.
 
         Raises:
             ValueError: there is none, or it is not readable.
@@ -114,7 +134,7 @@ class Run:
             raise ValueError(f"{self.seed_folder(seed)} has no checkpoint yet")
         trainer, params = self.trainer
         like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
-        state, header = checkpoint.load(paths[-1], like)
+        state, header = checkpoint.load(paths[max(paths) if epoch is None else epoch], like)
         return state, header["epoch"]
 
     def median_seed(self) -> int:
@@ -133,7 +153,10 @@ class Run:
             file.write(json.dumps(row) + "\n")
 
     def forget(self, seed: int, epoch: int) -> None:
-        """Drop the rows after so many epochs: those of epochs that will run again."""
+        """Drop rows and checkpoints after so many epochs: those of epochs that will run again."""
+        for later, path in self.checkpoints(seed).items():
+            if later > epoch:
+                path.unlink()
         rows = [json.dumps(row) + "\n" for row in self.rows(seed) if row["epoch"] <= epoch]
         path = self.seed_folder(seed) / "metrics.jsonl"
         partial = path.with_suffix(".partial")

@@ -6,6 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import jax
+
+from jaxouter.training import devices
 from jaxouter.training.run import Run
 from jaxouter.training.trainer import Trainer, TrainState
 
@@ -14,68 +17,69 @@ OnEpoch = Callable[[Trainer, TrainState], Row]
 Report = Callable[[int, Row], None]
 
 
-def begin(run: Run) -> dict[int, tuple[TrainState, int]]:
-    """State and epochs done of every seed: from its newest checkpoint, or prefilled.
-
-    Raises:
-        ValueError: a checkpoint is not readable, or the identification failed.
-    """
-    trainer, params = run.trainer
-    states = {}
-    for seed in run.seeds:
-        if run.checkpoints(seed):
-            states[seed] = run.load(seed)
-        else:
-            states[seed] = trainer.prefill(trainer.start(seed, params), params), 0
-    for seed, (_, done) in states.items():
-        run.forget(seed, done)
-    return states
-
-
 def train(
     run: Run,
-    states: dict[int, tuple[TrainState, int]],
     on_epoch: OnEpoch = lambda trainer, state: {},
     report: Report = lambda seed, row: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[int, TrainState] | None:
-    """Train every seed of a run, side by side, to the end.
+    """Train every seed of a run to the end, from the newest epoch of which all have a checkpoint, or from the start.
+
+    Each epoch is run for all seeds, as many at a time as the devices take, before the next one. Called in every
+    process; the first one alone reads and writes the folder, and calls `on_epoch` and `report`.
 
     Args:
         run: folder; metrics and checkpoints go there.
-        states: as `begin` gives them; used up.
         on_epoch: called with trainer and state after each epoch; what it returns joins the row (evaluation).
         report: called with seed and row after each epoch (progress).
-        stop: asked after each epoch whether to end early; everything is saved then.
+        stop: asked after each epoch whether to end early; everything is saved then. All processes end if one does.
 
     Returns:
-        The final state of each seed; None where it ended early.
+        The final state of each seed, on the host; None where it ended early.
+
+    Raises:
+        ValueError: a checkpoint is not readable, the identification failed, or there are too few devices.
     """
-    cfg, (trainer, params) = run.config, run.trainer
-    for epoch in range(cfg.epochs):
-        for seed, (state, done) in states.items():
-            if epoch < done:
-                continue
-            begin = time.perf_counter()
-            steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
-            state, metrics = trainer.epoch(state, params, steps)
-            states[seed] = state, epoch + 1
-            row: Row = {name: float(value) for name, value in metrics.items()}  # waits for the epoch to end
-            seconds = time.perf_counter() - begin
-            updates = steps // cfg.environments * cfg.updates
-            row = {
-                "epoch": epoch + 1,
-                "steps": int(state.steps),
-                "updates": int(state.learner.updates),
-                **row,
-                **on_epoch(trainer, state),
-                "seconds": seconds,
-                "steps_per_second": steps / seconds,
-                "updates_per_second": updates / seconds,
-            }
-            run.append(seed, row)
-            run.save(seed, epoch + 1, state)
-            report(seed, row)
-            if stop():
+    cfg, fleet, (trainer, params) = run.config, run.fleet, run.trainer
+    done = int(devices.text_from_first(lambda: str(run.common_epoch())))
+    rounds = [run.seeds[i : i + cfg.side_by_side] for i in range(0, cfg.seeds, cfg.side_by_side)]
+    states = {seeds: _begin(run, seeds, done) for seeds in rounds}
+    for epoch in range(done, cfg.epochs):
+        steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
+        for seeds in rounds:
+            begun = time.perf_counter()
+            states[seeds], metrics = fleet.epoch(states[seeds], params, steps)
+            metrics = devices.get(metrics)  # waits for the epoch to end
+            seconds = time.perf_counter() - begun
+            for i, (seed, state) in enumerate(zip(seeds, fleet.take(states[seeds]), strict=True)):
+                if not devices.is_first():
+                    continue
+                row: Row = {
+                    "epoch": epoch + 1,
+                    "steps": int(state.steps),
+                    "updates": int(state.learner.updates),
+                    **{name: float(value[i]) for name, value in metrics.items()},
+                    **on_epoch(trainer, state),
+                    "seconds": seconds,
+                    "steps_per_second": steps / seconds,
+                    "updates_per_second": steps // cfg.environments * cfg.updates / seconds,
+                }
+                run.append(seed, row)
+                run.save(seed, epoch + 1, state)
+                report(seed, row)
+            if devices.any_process(stop()):
                 return None
-    return {seed: state for seed, (state, _) in states.items()}
+    return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
+
+
+def _begin(run: Run, seeds: range, done: int) -> TrainState:
+    """States of some seeds after so many epochs: from their checkpoints, or prefilled."""
+    trainer, params = run.trainer
+    like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
+
+    def whole(seed: int) -> TrainState:
+        run.forget(seed, done)
+        return run.load(seed, done)[0] if done else trainer.start(seed, params)
+
+    states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
+    return states if done else run.fleet.prefill(states, params)

@@ -27,6 +27,7 @@ from jaxouter.training.config import TrainConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
+AXIS = "environments"  # over the shards of a learner
 HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
 
 
@@ -45,12 +46,16 @@ class TrainState(NamedTuple):
 
 @dataclass(frozen=True)
 class Trainer:
-    """The pure functions of one training run. Static and hashable."""
+    """The pure functions of one training run, or of one of the shards into which its environments are split.
 
-    config: TrainConfig
+    Static and hashable. Shards run as members of the mapped axis `AXIS`; learner, key and counters are the same in all.
+    """
+
+    config: TrainConfig  # environments and batch size are those of one shard
     env: Environment
     policy: LearnedPolicy
-    replay: Replay
+    replay: Replay  # of one shard
+    shards: int = 1
 
     @property
     def learner(self) -> DDPG:
@@ -91,6 +96,14 @@ class Trainer:
         """What the policy has learned so far."""
         return LearnedParams(state.learner.actor, state.prior)
 
+    def split(self, key: chex.PRNGKey, n: int) -> list[chex.PRNGKey]:
+        """The next key, the same in every shard, and n - 1 keys to draw with, of this shard alone."""
+        after, *draws = jax.random.split(key, n)
+        return [after, *(self._own(key) for key in draws)]
+
+    def _own(self, key: chex.PRNGKey) -> chex.PRNGKey:
+        return key if self.shards == 1 else jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+
     def vector_step(
         self, state: TrainState, params: EnvParams, action: jax.Array, key: chex.PRNGKey
     ) -> tuple[TrainState, jax.Array, jax.Array]:
@@ -120,7 +133,7 @@ class Trainer:
             env=env,
             obs=obs,
             replay=self.replay.write(state.replay, row),
-            steps=state.steps + self.config.environments,
+            steps=state.steps + self.config.environments * self.shards,
         )
         return state, reward, terminated | truncated
 
@@ -148,34 +161,39 @@ class Trainer:
 
         def step(carry: tuple[TrainState, jax.Array], _: Any) -> tuple[tuple[TrainState, jax.Array], None]:
             state, action = carry
-            key, key_redraw, key_action, key_env = jax.random.split(state.key, 4)
+            key, key_redraw, key_action, key_env = self.split(state.key, 4)
             redraw = jax.random.uniform(key_redraw, (environments,), float) < HOLD
             fresh = jax.random.uniform(key_action, (environments,), float, -1.0, 1.0)
             action = jnp.where(redraw, fresh, action)
             state, _, _ = self.vector_step(state._replace(key=key), params, action, key_env)
             return (state, action), None
 
-        first = jax.random.uniform(jax.random.fold_in(state.key, 0), (environments,), float, -1.0, 1.0)
-        (state, _), _ = jax.lax.scan(step, (state, first), None, self.config.prefill // environments)
+        key_first = self._own(jax.random.fold_in(state.key, 0))
+        first = jax.random.uniform(key_first, (environments,), float, -1.0, 1.0)
+        (state, _), _ = jax.lax.scan(step, (state, first), None, self.config.prefill // (environments * self.shards))
         return state
 
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """`steps` environment steps (over all environments) of exploration and learning.
+        """`steps` environment steps (over all environments of all shards) of exploration and learning.
 
         Returns:
             The state, and means over the epoch: the learner's metrics and `reward` (a step, with exploration).
         """
         cfg = self.config
         low, high = cfg.noise_sigma
-        sigma = jnp.geomspace(low, high, cfg.environments) if cfg.environments > 1 else jnp.full(1, high)
+        environments = cfg.environments * self.shards
+        sigma = jnp.geomspace(low, high, environments) if environments > 1 else jnp.full(1, high)
+        if self.shards > 1:
+            first = jax.lax.axis_index(AXIS) * cfg.environments
+            sigma = jax.lax.dynamic_slice_in_dim(sigma, first, cfg.environments)
 
         def update(carry: LearnerState, key: chex.PRNGKey, replay: ReplayState) -> tuple[LearnerState, Any]:
             key_batch, key_update = jax.random.split(key)
             return self.learner.update(carry, self.batch(replay, key_batch), key_update)
 
         def step(state: TrainState, _: Any) -> tuple[TrainState, dict[str, jax.Array]]:
-            key, key_noise, key_env, key_updates = jax.random.split(state.key, 4)
+            key, key_noise, key_env, key_updates = self.split(state.key, 4)
             progress = state.steps.astype(float) / cfg.steps
             volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
             normal = jax.random.normal(key_noise, state.noise.shape, state.noise.dtype)
@@ -188,25 +206,35 @@ class Trainer:
             state = state._replace(learner=learner, noise=jnp.where(done, 0.0, explore))
             return state, {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
 
-        state, metrics = jax.lax.scan(step, state, None, steps // cfg.environments)
-        return state, jax.tree.map(jnp.mean, metrics)
+        state, metrics = jax.lax.scan(step, state, None, steps // environments)
+        metrics = jax.tree.map(jnp.mean, metrics)
+        return state, metrics if self.shards == 1 else jax.lax.pmean(metrics, AXIS)
 
 
-def build(config: TrainConfig) -> tuple[Trainer, EnvParams]:
-    """The trainer of a configuration, and the parameters of its environments.
+def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
+    """The trainer of a configuration (of one of so many shards of it), and the parameters of its environments.
 
     Raises:
         ValueError: the configuration does not fit together.
     """
     plant, _ = make_plant(config.check().plant)
+    total_updates = config.total_updates
     env, params = environment.make(
         config.plant,
         history=config.history,
         integral_steps=config.integral_steps,
         goal=SetPoint(*plant.setpoint_range, config.redraw),
     )
-    learner = DDPG(config.ddpg, env.observer.size, total_updates=config.total_updates)
     per_environment = min(config.replay, config.steps) // config.environments  # it never holds more than there is
+    config = replace(
+        config,
+        environments=config.environments // shards,
+        ddpg=replace(config.ddpg, batch_size=config.ddpg.batch_size // shards),
+        seed=0,  # the functions are the same for all seeds, and compiled once
+        seeds=1,
+        devices=1,
+    )
+    axis = AXIS if shards > 1 else None
+    learner = DDPG(config.ddpg, env.observer.size, total_updates=total_updates, axis=axis)
     replay = Replay(FIELDS, config.environments, per_environment, env.observer.history, config.ddpg.n_step)
-    config = replace(config, seed=0, seeds=1)  # the functions are the same for all seeds, and compiled once
-    return Trainer(config, env, LearnedPolicy(env.observer, learner), replay), params
+    return Trainer(config, env, LearnedPolicy(env.observer, learner), replay, shards), params

@@ -31,6 +31,9 @@ def test_paper_preset_is_the_papers(plant, steps):
         ({"seed": -1}, "seed is -1; it must not be negative"),
         ({"epoch": 100}, "epoch is 100; it must be a multiple of the 16 environments"),
         ({"replay": 100}, "replay is 100; it must hold at least a batch of 256"),
+        ({"devices": 0}, "devices is 0; it must be positive"),
+        ({"seeds": 3, "devices": 2}, "devices is 2 and seeds is 3; one must be a multiple of the other"),
+        ({"devices": 32}, "environments is 16; it must be a multiple of the 32 devices that each of the 1 seeds gets"),
         ({"prefill": 160}, "prefill is 160; it must lie between the batch size, 256, and the"),
         ({"redraw": 1.5}, "redraw is 1.5"),
         ({"noise_sigma": (0.0, 0.1)}, r"noise_sigma is \(0.0, 0.1\)"),
@@ -49,6 +52,12 @@ def test_unknown_preset_lists_those_that_exist():
 def test_configuration_with_an_unknown_field_is_refused():
     with pytest.raises(ValueError, match="speed"):
         from_dict({**to_dict(preset("pitch")), "speed": 3})
+
+
+def test_configuration_of_before_there_were_devices_has_one():
+    values = to_dict(preset("pitch"))
+    del values["devices"]
+    assert from_dict(values) == preset("pitch")
 
 
 def test_last_epoch_may_be_shorter():

@@ -9,7 +9,7 @@ import pytest
 
 from jaxouter.training import checkpoint
 from jaxouter.training.run import KEEP, Run
-from jaxouter.training.train import begin, train
+from jaxouter.training.train import train
 from tests.training.small import small
 
 
@@ -26,13 +26,15 @@ def rows_without_times(run: Run, seed: int):
 
 def test_stop_save_and_go_on_equals_an_uninterrupted_run(tmp_path):
     whole, halved = new_run(tmp_path / "whole", seeds=2), new_run(tmp_path / "halved", seeds=2)
-    finals = train(whole, begin(whole))
+    finals = train(whole)
     assert finals is not None
     asked = iter([False, False, True])  # seed 0 has one epoch more than seed 1 then
-    assert train(halved, begin(halved), stop=lambda: next(asked)) is None
+    assert train(halved, stop=lambda: next(asked)) is None
     again = Run.open(halved.path)
-    resumed = train(again, begin(again))
+    resumed = train(again)
     chex.assert_trees_all_equal(finals, resumed)
+    assert whole.fleet.prefill._cache_size() == again.fleet.prefill._cache_size() == 1
+    assert whole.fleet.epoch._cache_size() == again.fleet.epoch._cache_size() == 2  # of two lengths, whatever the seed
     for seed in (0, 1):
         assert rows_without_times(whole, seed) == rows_without_times(again, seed)
         assert [row["epoch"] for row in whole.rows(seed)] == [1, 2, 3]
@@ -41,17 +43,31 @@ def test_stop_save_and_go_on_equals_an_uninterrupted_run(tmp_path):
 
 def test_rows_of_an_epoch_that_was_not_saved_are_dropped_on_resumption(tmp_path):
     run = new_run(tmp_path / "run")
-    train(run, begin(run), stop=lambda: True)
+    train(run, stop=lambda: True)
     run.append(0, {"epoch": 2})  # as after a kill between row and checkpoint
-    assert train(run, begin(run)) is not None
+    assert train(run) is not None
     assert [row["epoch"] for row in run.rows(0)] == [1, 2, 3]
+
+
+def test_seeds_go_on_together_from_the_newest_epoch_that_all_have(tmp_path):
+    run = new_run(tmp_path / "run", seeds=3)
+    for seed, epochs in ((0, (1, 2)), (1, (1, 2)), (2, (1,))):
+        for epoch in epochs:
+            (run.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz").touch()
+    assert run.common_epoch() == 1
+    run.forget(0, 1)
+    assert list(run.checkpoints(0)) == [1]
+    (run.seed_folder(2) / "checkpoint-000001.npz").unlink()
+    with pytest.raises(
+        ValueError, match=r"no checkpoint of the same epoch \(seed 0: \[1\]; seed 1: \[1, 2\]; seed 2: none"
+    ):
+        run.common_epoch()
 
 
 def test_each_epoch_is_reported_with_what_on_epoch_gave(tmp_path):
     run, reported = new_run(tmp_path / "run"), []
     train(
         run,
-        begin(run),
         lambda trainer, state: {"mae": float(state.steps)},
         lambda seed, row: reported.append((seed, row)),
     )
@@ -61,7 +77,7 @@ def test_each_epoch_is_reported_with_what_on_epoch_gave(tmp_path):
 
 def test_old_checkpoints_are_removed(tmp_path):
     run = new_run(tmp_path / "run")
-    train(run, begin(run))
+    train(run)
     assert len(run.checkpoints(0)) == KEEP
     assert run.load(0)[1] == 3
 

@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from jaxouter.agents.adam import adam
 from jaxouter.agents.ddpg import descend
 from jaxouter.agents.networks import Actor
 from jaxouter.evaluation.cache import Tuned
@@ -78,7 +79,7 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
     scaled = (r_tilde - (low + high) / 2) / ((high - low) / 2)
     key_init, key_batches = jax.random.split(key)
     params = Actor(policy.hidden, 1).init(key_init, jnp.zeros(policy.observer.size))
-    adam = optax.adam(optax.cosine_decay_schedule(RATE, UPDATES))
+    optimiser = adam(optax.cosine_decay_schedule(RATE, UPDATES))
 
     def error(params: Any, episode: jax.Array, t: jax.Array) -> jax.Array:
         back = t - jnp.arange(1, H + 1)
@@ -91,9 +92,9 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
         episode = jax.random.randint(key_episode, (BATCH,), 0, episodes)
         t = H + jnp.floor(jax.random.uniform(key_t, (BATCH,)) * (steps + 1 - H - h)).astype(episode.dtype)
         gradient = jax.grad(lambda p: jnp.mean(jax.vmap(error, (None, 0, 0))(p, episode, t)))(params)
-        return descend(adam, gradient, state, params), None
+        return descend(optimiser, gradient, state, params), None
 
-    return jax.lax.scan(update, (params, adam.init(params)), jax.random.split(key_batches, UPDATES))[0][0]
+    return jax.lax.scan(update, (params, optimiser.init(params)), jax.random.split(key_batches, UPDATES))[0][0]
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:

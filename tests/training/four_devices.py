@@ -1,0 +1,115 @@
+"""What `test_devices` runs in a process of four devices."""
+
+from dataclasses import replace
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from jaxouter import plants
+from jaxouter.training.devices import Fleet, spread
+from jaxouter.training.run import Run
+from jaxouter.training.train import train
+from jaxouter.training.trainer import FIELDS
+from tests.training.small import small
+
+SHORT = dict(steps=1_280, epoch=320, noise_sigma=(1e-4, 0.5))  # two epochs
+
+
+@pytest.fixture(scope="module")
+def spanning(tmp_path_factory):
+    """A run of one learner on four devices, stopped after its first epoch."""
+    run = Run.create(small(devices=4, **SHORT), tmp_path_factory.mktemp("spanning") / "run")
+    assert train(run, stop=lambda: True) is None
+    return run
+
+
+def test_seeds_on_devices_of_their_own_equal_single_runs(tmp_path):
+    together = train(Run.create(small(seeds=4, devices=2, **SHORT), tmp_path / "together"))
+    assert together is not None
+    for seed in (1, 2):  # one on each device, of different rounds
+        alone = train(Run.create(small(seed=seed, **SHORT), tmp_path / f"alone-{seed}"))
+        assert alone is not None
+        chex.assert_trees_all_close(together[seed].learner, alone[seed].learner, rtol=1e-5, atol=1e-6)
+        chex.assert_trees_all_close(together[seed].replay, alone[seed].replay, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("seeds", "shards"), [(1, 4), (2, 2)])
+def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
+    config = small(seeds=seeds, devices=4, **SHORT)
+    fleet = Fleet.of(config)
+    assert dict(fleet.mesh.shape) == {"seeds": seeds, "environments": shards}
+    trainer, params = Run(None, config).trainer
+    state = fleet.prefill(fleet.put([trainer.start(seed, params) for seed in range(seeds)]), params)
+    before = fleet.take(state)
+    state, metrics = fleet.epoch(state, params, 320)
+    after = fleet.take(state)
+    for leaf in jax.tree.leaves((state.learner, metrics)):
+        by_seed = {}
+        for shard in leaf.addressable_shards:
+            np.testing.assert_array_equal(shard.data, by_seed.setdefault(shard.index[0].start, shard.data))
+        assert len(by_seed) == seeds
+    for i in range(seeds):
+        assert int(after[i].steps) == 960
+        assert int(after[i].learner.updates) == 40
+        assert not np.array_equal(*(jax.tree.leaves(states[i].learner.actor)[0] for states in (before, after)))
+        written = after[i].replay.rows[:, trainer.replay.mirror :][:, :120]
+        action = written[..., FIELDS.index("action")]
+        assert len(np.unique(action[:, 0])) == 8  # no two environments draw alike
+        assert np.all(np.diff(np.std(np.diff(action[:, 80:]), 1)[::2]) > 0)  # the ladder goes on from shard to shard
+
+
+def test_checkpoint_of_four_devices_goes_on_with_one(spanning):
+    written, done = spanning.load(0)
+    assert (done, written.replay.rows.shape[0], len(written.noise)) == (1, 8, 8)
+    on_one = replace(spanning, config=replace(spanning.config, devices=1))
+    chex.assert_trees_all_equal(on_one.fleet.take(on_one.fleet.put([written]))[0], jax.device_get(written))
+    finals = train(on_one)
+    assert finals is not None
+    assert int(finals[0].steps) == 1_280
+    assert [row["epoch"] for row in spanning.rows(0)] == [1, 2]
+
+
+def test_compiled_loop_copies_no_part_of_the_replay(spanning):
+    fleet, (trainer, params) = spanning.fleet, spanning.trainer
+    state = fleet.put([trainer.start(0, params)])
+    text = fleet.epoch.lower(state, params, 320).compile().as_text()
+    part = ",".join(map(str, (2, *state.replay.rows.shape[2:])))
+    lines = [line for line in text.splitlines() if f"f32[{part}]" in line or f"f32[1,{part}]" in line]
+    assert lines
+    assert sum(" copy(" in line for line in lines) <= 1  # before the loop
+
+
+def test_houses_on_four_devices_are_those_of_one():
+    n = 4_096
+    plant, params = plants.make("heaters", n=n, Ca=np.linspace(8.0, 12.0, n))
+    over = spread(params, n, 4)
+    assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(over)} == {4}
+    step = jax.jit(plant.step)
+    state, r_tilde, key = plant.init(jax.random.key(0), params), jax.numpy.array(20.0), jax.random.key(1)
+    one, four = step(params, state, r_tilde, key), step(over, spread(state, n, 4), r_tilde, key)
+    assert four.x.addressable_shards[0].data.shape == (n // 4,)
+    np.testing.assert_allclose(one.x, four.x, rtol=1e-6)
+    text = step.lower(over, spread(state, n, 4), r_tilde, key).compile().as_text()
+    assert f"f32[10,{n // 4}]" in text
+    assert f",{n}]" not in text  # no device draws for all
+
+
+def test_simulation_of_houses_on_four_devices_is_that_of_one():
+    n = 64
+    plant, params = plants.make("heaters", n=n, Ca=np.linspace(8.0, 12.0, n))
+    runs = [plants.simulate(plant, p, [20.0] * 5, jax.random.key(0)) for p in (params, spread(params, n, 4))]
+    np.testing.assert_allclose(*runs, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Fleet.of(small(devices=8)), "devices is 8; it must be at most what there is: .*3"),
+        (lambda: spread({}, 10, 4), "devices is 4; it must divide the 10 members and be at most 4"),
+    ],
+)
+def test_devices_that_do_not_fit_are_named(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
