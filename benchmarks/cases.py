@@ -233,7 +233,7 @@ def random_roll_out(plant: str, environments: int) -> Job:
 
 def policy_roll_out(plant: str, environments: int) -> Job:
     trainer, params = build(preset(plant))
-    learned = trainer.policy_params(trainer.fresh(jax.random.key(0), params))
+    learned = trainer.policy_params(trainer.start(0, params))
 
     def act(learned: Any, key: jax.Array, obs: jax.Array, r: jax.Array) -> jax.Array:
         action = trainer.learner.act(learned.actor, obs)[:, 0]
@@ -292,7 +292,7 @@ def update(plant: str, name: str) -> Job:
     """Updates alone, all with one batch."""
     trainer, params, config = training(plant, name)
     state, updates = filled(trainer, params), 100
-    batch = trainer.batch(state.replay, state.key)
+    batch = trainer.batch(state.replay, jax.random.bits(state.key, (config.ddpg.batch_size, 2)))
 
     def run(learner: Any, batch: Any) -> tuple[Any, Any]:
         keys = jax.random.split(jax.random.key(0), updates)

@@ -30,7 +30,8 @@ def main(preset_name: Literal["paper", "default"] = "paper", updates: int = 300,
     packed = jax.random.normal(jax.random.key(0), (steps, 2 * size + 3)) * 0.1
 
     def from_windows(key: jax.Array) -> Batch:
-        return trainer.batch(state.replay._replace(written=jnp.asarray(trainer.replay.steps)), key)
+        bits = jax.random.bits(key, (cfg.batch_size, 2))
+        return trainer.batch(state.replay._replace(written=jnp.asarray(trainer.replay.steps)), bits)
 
     def from_packed(key: jax.Array) -> Batch:
         rows = packed[jax.random.randint(key, (cfg.batch_size,), 0, steps)]

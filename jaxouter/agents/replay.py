@@ -63,20 +63,25 @@ class Replay:
         buffer = jax.lax.dynamic_update_slice(buffer, slab, (0, twin, 0))
         return ReplayState(buffer, state.written + 1)
 
-    def sample(self, state: ReplayState, key: chex.PRNGKey, n: int) -> tuple[jax.Array, jax.Array]:
+    def sample(self, state: ReplayState, bits: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.
 
         At least `window` rows must have been written. Once the ring is full, rows whose lead is already overwritten
         are not drawn.
 
+        Args:
+            state: contents.
+            bits: random, (n, 2), uint32, as of `jax.random.bits`: which environments, and which of their rows.
+
         Returns:
             rows (n, lead + window, width) and `valid` (n, lead + window): which rows lie in the same episode as row
             `lead`, the first transition. Rows that are not valid hold other episodes, or nothing.
         """
-        key_environment, key_row = jax.random.split(key)
-        environment = jax.random.randint(key_environment, (n,), 0, self.environments)
+        chex.assert_type(bits, jnp.uint32)
         oldest = jnp.maximum(self.window - 1, state.written - self.steps + self.mirror)
-        last = jax.random.randint(key_row, (n,), oldest, state.written)  # number of a window's last row
+        environment = (bits[:, 0] % jnp.uint32(self.environments)).astype(jnp.int32)
+        # Number of a window's last row. The remainder favours early rows by at most their number over 2^32.
+        last = oldest + (bits[:, 1] % (state.written - oldest).astype(jnp.uint32)).astype(jnp.int32)
         size = (1, self.mirror + 1, len(self.fields))
         rows = jax.vmap(lambda e, i: jax.lax.dynamic_slice(state.rows, (e, i, jnp.zeros_like(i)), size)[0])(
             environment, last % self.steps

@@ -27,6 +27,8 @@ from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant
 from jaxouter.plants import make as make_plant
 
+RESET = 1  # folded into the key of a step that ends an episode
+
 
 @struct.dataclass
 class EnvParams:
@@ -91,9 +93,8 @@ class Environment:
         """
         chex.assert_rank(action, 0)
         plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
-        key_plant, key_sensor = jax.random.split(key)
         r_tilde = jnp.clip(action, *plant.r_tilde_bounds)
-        plant_state = plant.step(p, state.plant, r_tilde, key_plant)
+        plant_state = plant.step(p, state.plant, r_tilde, key)
         y = plant.output(p, plant_state)
 
         low, high = plant.divergence_bounds
@@ -105,7 +106,7 @@ class Environment:
         reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, before)
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
 
-        y_seen = sensor.measure(params.sensor, key_sensor, y, state.y_seen)
+        y_seen = sensor.measure(params.sensor, key, y, state.y_seen)
         goal, r = self.goal.step(state.goal, y_seen)
         memory = self.observer.record(state.memory, state.y_seen, r_tilde)
         memory, obs = self.observer.observe(memory, r, y_seen)
@@ -119,10 +120,13 @@ class Environment:
 
         The observation that ended it is `info["final_observation"]`: bootstrap from it unless terminated.
         """
-        key_step, key_reset = jax.random.split(key)
-        obs, after, reward, terminated, truncated, info = self.step_env(key_step, state, action, params)
+        obs, after, reward, terminated, truncated, info = self.step_env(key, state, action, params)
         done = terminated | truncated
-        new_obs, new = _if_any(done, self.reset, (key_reset, params), (obs, after))
+
+        def reset(key: chex.PRNGKey, params: EnvParams) -> tuple[jax.Array, EnvState]:
+            return self.reset(jax.random.fold_in(key, RESET), params)
+
+        new_obs, new = _if_any(done, reset, (key, params), (obs, after))
         new = new._replace(plant=self.plant.reuse(after.plant, new.plant))
         obs, after = jax.tree.map(lambda a, b: jnp.where(done, a, b), (new_obs, new), (obs, after))
         return obs, after, reward, terminated, truncated, info

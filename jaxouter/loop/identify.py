@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import chex
@@ -14,6 +15,7 @@ from jaxouter.loop.references import telegraph
 from jaxouter.plants import Plant, simulate
 
 LEVELS = 8
+RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
 
 
 class DcGain(NamedTuple):
@@ -31,6 +33,18 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
     Raises:
         ValueError: y did not depend on r~, or was not finite.
     """
+    levels, y = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
+    centred = levels - np.mean(levels)
+    gain = np.sum(centred * y) / np.sum(centred**2)
+    if not np.isfinite(gain) or abs(gain) < 1e-6:
+        bounds = plant.r_tilde_bounds
+        raise ValueError(f"the DC gain of {plant.name} came out as {gain}: no r~ in {bounds} moves its output")
+    return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(y) - gain * np.mean(levels)))
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
+def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+    """Levels of r~ (8,), and where y comes to under each (8,)."""
     low, high = plant.r_tilde_bounds
     levels = low + (high - low) * (jnp.arange(LEVELS, dtype=float) + 0.5) / LEVELS
 
@@ -40,12 +54,7 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
         y = simulate(plant, params, jnp.full(plant.episode_steps, level), key_run, state)
         return jnp.mean(y[-max(1, plant.episode_steps // 10) :])
 
-    y = jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
-    centred = levels - jnp.mean(levels)
-    gain = jnp.sum(centred * y) / jnp.sum(centred**2)
-    if not jnp.isfinite(gain) or abs(gain) < 1e-6:
-        raise ValueError(f"the DC gain of {plant.name} came out as {gain}: no r~ in {(low, high)} moves its output")
-    return DcGain(gain, jnp.mean(y) - gain * jnp.mean(levels))
+    return levels, jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
 
 
 def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, AffineParams]:

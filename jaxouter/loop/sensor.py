@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+SENSOR = 2  # folded into the key
+
 
 @struct.dataclass
 class SensorParams:
@@ -29,10 +31,11 @@ def params(noise: float = 0.0, bias: float = 0.0, missing: float = 0.0) -> Senso
 
 
 def measure(p: SensorParams, key: chex.PRNGKey, y: jax.Array, last: jax.Array) -> jax.Array:
-    """What is seen of y (scalar), when `last` was seen before."""
+    """What is seen of y (scalar), when `last` was seen before; the plant's noise may have the same key."""
 
     def disturbed(key: chex.PRNGKey) -> jax.Array:
-        noise, chance = jax.random.normal(key, (2,), y.dtype)  # one draw: each one more costs time to compile
+        # One draw: each one more costs time to compile.
+        noise, chance = jax.random.normal(jax.random.fold_in(key, SENSOR), (2,), y.dtype)
         lost = jax.scipy.special.ndtr(chance) < p.missing
         return jnp.where(lost, last, y + p.bias + p.noise * noise)
 

@@ -236,12 +236,12 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
     """
     del key
     p, h = params, CONTROL_STEP / params.substeps
-    lags = [value / h for value in (p.tau, p.d1, p.d2)]
+    tau = jnp.where(_served(p), p.tau, jnp.nan)
+    lags = [value / h for value in (tau, p.d1, p.d2)]
     z = jnp.concatenate([state.x, state.xc[None], state.xi[None]])
     r_tilde_line = delay.write(state.r_tilde_line, state.k, r_tilde)
     advance = _inner_steps if p.late is None else _whole_step
     z, lines = advance(p, z, state.lines, r_tilde_line, state.k, lags)
-    z = jnp.where(_served(p), z, jnp.nan)
     return PitchState(z[:4], z[4], z[5], lines, r_tilde_line, state.k + 1)
 
 
@@ -261,18 +261,27 @@ def _whole_step(
     assert p.late is not None
     n, first = p.substeps, k * p.substeps
     late = [i for i in range(3) if p.late[i]]
-    seen = {i: delay.window(lines[row], first, lags[i] - 0.5, n) for row, i in enumerate(late)}
-    theta_e = delay.held_window(r_tilde_line, k, lags[0], n) - seen[0]
-    bias = p.disturbance + p.W[0]
-    matrix = _propagator(p, late)
-    if late == [0]:  # u has no delayed part: what it gets is the same in all inner steps
-        matrix = jnp.concatenate([matrix[:, : 6 + n], bias * jnp.sum(matrix[:, 6 + n :], 1, keepdims=True)], 1)
-        inputs = [z, theta_e, jnp.ones_like(z[:1])]
+    of_z, of_theta_e, of_u = jnp.split(_propagator(p, late), [6, 6 + n], 1)
+    asked = delay.held_window(r_tilde_line, k, lags[0], n)
+    theta, *fed_back = (delay.window(lines[row], first, lags[i] - 0.5, n) for row, i in enumerate(late))
+    constant = (p.disturbance + p.W[0]) * jnp.sum(of_u, 1, keepdims=True)
+    parts = [(of_z, z), (constant, jnp.ones_like(z[:1]))]
+    delayed = [(of_theta_e, asked), (-of_theta_e, theta), *((-p.gain * of_u, signal) for signal in fed_back)]
+    if z.ndim > 1 and all(lag.ndim == 0 for lag in lags):  # all is linear in rows as they stand: one product
+        parts += [(_dot(matrix, weights), rows) for matrix, (weights, rows) in delayed]
+        out = _stacked(parts)
     else:
-        inputs = [z, theta_e, bias - p.gain * sum(seen[i] for i in late[1:])]
-    out = _dot(matrix, jnp.concatenate(inputs))
+        out = _stacked(parts) + _dot(of_theta_e, asked[1] - theta[1])
+        for weights, rows in fed_back:
+            out = out - _dot(p.gain * _dot(of_u, weights), rows)
     samples = out[6:].reshape(len(late), n, *z.shape[1:])
     return out[:6], delay.write_block(lines, k, samples)
+
+
+def _stacked(parts: list[tuple[jax.Array, jax.Array]]) -> jax.Array:
+    """Sum of the products of matrices (m, n_i) and rows (n_i, ...), as one."""
+    matrices, rows = zip(*parts, strict=True)
+    return _dot(jnp.concatenate(matrices, 1), jnp.concatenate(rows))
 
 
 def _propagator(p: PitchParams, late: list[int]) -> jax.Array:

@@ -22,6 +22,7 @@ from jax.sharding import PartitionSpec as P
 
 from jaxouter.agents.replay import ReplayState
 from jaxouter.loop.environment import EnvParams
+from jaxouter.loop.identify import RUN_ONCE
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.trainer import AXIS, Trainer, TrainState, build
 
@@ -255,7 +256,7 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
     # Told where its results are, XLA does not choose another layout that would be compiled for once more.
     layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), LAYOUT)
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=layout)
+    @partial(jax.jit, donate_argnums=0, out_shardings=layout, compiler_options=RUN_ONCE)
     def prefill(states: TrainState, params: EnvParams) -> TrainState:
         return mapped(fleet.trainer.prefill, LAYOUT)(states, params)
 

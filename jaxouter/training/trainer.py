@@ -69,12 +69,15 @@ class Trainer:
             ValueError: the identification failed.
         """
         key_prior, key = jax.random.split(jax.random.key(seed))
-        state = self.fresh(key, params)
+        state = self._fresh(key, params)
         if self.config.residual:
             return state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
         return state
 
-    @partial(jax.jit, static_argnums=0)
+    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
+    def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
+        return self.fresh(key, params)
+
     def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         """Random networks, reset environments, an empty replay; a zero action is the middle of the range of r~."""
         key, key_learner, key_env = jax.random.split(key, 3)
@@ -96,25 +99,26 @@ class Trainer:
         """What the policy has learned so far."""
         return LearnedParams(state.learner.actor, state.prior)
 
-    def split(self, key: chex.PRNGKey, n: int) -> list[chex.PRNGKey]:
-        """The next key, the same in every shard, and n - 1 keys to draw with, of this shard alone."""
-        after, *draws = jax.random.split(key, n)
-        return [after, *(self._own(key) for key in draws)]
+    def keys(self, state: TrainState, steps: int, n: int) -> list[chex.PRNGKey]:
+        """N keys for each of the next `steps` steps of all environments, (steps,) each, of this shard alone.
 
-    def _own(self, key: chex.PRNGKey) -> chex.PRNGKey:
-        return key if self.shards == 1 else jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+        They depend on the number of the step, not on where an epoch began. Numbers are drawn from them for all steps
+        at once, before the loop: within it each draw would cost as much as a small matrix product.
+        """
+        numbers = state.steps + self.config.environments * self.shards * jnp.arange(steps, dtype=state.steps.dtype)
+        key = state.key if self.shards == 1 else jax.random.fold_in(state.key, jax.lax.axis_index(AXIS))
+        return list(jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), n), out_axes=1)(numbers))
 
     def vector_step(
-        self, state: TrainState, params: EnvParams, action: jax.Array, key: chex.PRNGKey
+        self, state: TrainState, params: EnvParams, action: jax.Array, keys: chex.PRNGKey
     ) -> tuple[TrainState, jax.Array, jax.Array]:
-        """Every environment takes one step with its action (E,), and its row goes into the replay.
+        """Every environment takes one step with its action (E,) and key (E,), and its row goes into the replay.
 
         Returns:
             The state, rewards (E,) as the plant gives them, and whether each episode ended (E,).
         """
         before = state.env
         r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.prior, before.r, action)
-        keys = jax.random.split(key, self.config.environments)
         obs, env, reward, terminated, truncated, info = jax.vmap(self.env.step, (0, 0, 0, None))(
             keys, before, r_tilde, params
         )
@@ -137,10 +141,10 @@ class Trainer:
         )
         return state, reward, terminated | truncated
 
-    def batch(self, replay: ReplayState, key: chex.PRNGKey) -> Batch:
-        """A batch of transitions, built from windows of signals."""
+    def batch(self, replay: ReplayState, bits: jax.Array) -> Batch:
+        """A batch of transitions, built from windows of signals, drawn by random bits (B, 2), uint32."""
         cfg = self.config.ddpg
-        windows, _ = self.replay.sample(replay, key, cfg.batch_size)
+        windows, _ = self.replay.sample(replay, bits)
 
         def transition(rows: jax.Array) -> Batch:
             field = dict(zip(FIELDS, rows.T, strict=True))
@@ -158,20 +162,21 @@ class Trainer:
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
         """Random actions, each held for ten steps on average, until the replay holds `config.prefill` steps."""
         environments = self.config.environments
+        steps = self.config.prefill // (environments * self.shards)
+        keys_redraw, keys_action, keys_env = self.keys(state, steps, 3)
+        redraw = jax.vmap(lambda key: jax.random.uniform(key, (environments,), float) < HOLD)(keys_redraw)
+        fresh = jax.vmap(lambda key: jax.random.uniform(key, (environments,), float, -1.0, 1.0))(keys_action)
+        held = jax.lax.cummax(jnp.where(redraw, jnp.arange(steps)[:, None], 0))  # the step of the last redraw
+        actions = jnp.take_along_axis(fresh, held, 0)
 
-        def step(carry: tuple[TrainState, jax.Array], _: Any) -> tuple[tuple[TrainState, jax.Array], None]:
-            state, action = carry
-            key, key_redraw, key_action, key_env = self.split(state.key, 4)
-            redraw = jax.random.uniform(key_redraw, (environments,), float) < HOLD
-            fresh = jax.random.uniform(key_action, (environments,), float, -1.0, 1.0)
-            action = jnp.where(redraw, fresh, action)
-            state, _, _ = self.vector_step(state._replace(key=key), params, action, key_env)
-            return (state, action), None
+        def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, None]:
+            return self.vector_step(state, params, *xs)[0], None
 
-        key_first = self._own(jax.random.fold_in(state.key, 0))
-        first = jax.random.uniform(key_first, (environments,), float, -1.0, 1.0)
-        (state, _), _ = jax.lax.scan(step, (state, first), None, self.config.prefill // (environments * self.shards))
-        return state
+        return jax.lax.scan(step, state, (actions, self._keys_env(keys_env)))[0]
+
+    def _keys_env(self, keys: chex.PRNGKey) -> chex.PRNGKey:
+        """Keys (steps,) -> (steps, E)."""
+        return jax.vmap(lambda key: jax.random.split(key, self.config.environments))(keys)
 
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -188,25 +193,32 @@ class Trainer:
             first = jax.lax.axis_index(AXIS) * cfg.environments
             sigma = jax.lax.dynamic_slice_in_dim(sigma, first, cfg.environments)
 
-        def update(carry: LearnerState, key: chex.PRNGKey, replay: ReplayState) -> tuple[LearnerState, Any]:
-            key_batch, key_update = jax.random.split(key)
-            return self.learner.update(carry, self.batch(replay, key_batch), key_update)
+        keys_noise, keys_env, keys_batch, keys_update = self.keys(state, steps // environments, 4)
+        shape = (cfg.updates, cfg.ddpg.batch_size, 2)
+        xs = (
+            jax.vmap(lambda key: jax.random.normal(key, state.noise.shape, state.noise.dtype))(keys_noise),
+            self._keys_env(keys_env),
+            jax.vmap(lambda key: jax.random.bits(key, shape, jnp.uint32))(keys_batch),
+            jax.vmap(lambda key: jax.random.split(key, cfg.updates))(keys_update),
+        )
 
-        def step(state: TrainState, _: Any) -> tuple[TrainState, dict[str, jax.Array]]:
-            key, key_noise, key_env, key_updates = self.split(state.key, 4)
+        def step(state: TrainState, xs: Any) -> tuple[TrainState, dict[str, jax.Array]]:
+            normal, keys_env, bits, keys_update = xs
             progress = state.steps.astype(float) / cfg.steps
             volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
-            normal = jax.random.normal(key_noise, state.noise.shape, state.noise.dtype)
             explore = noise.ornstein_uhlenbeck(state.noise, normal, cfg.noise_theta, volatility)
             action = jnp.clip(self.learner.act(state.learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
-            state, reward, done = self.vector_step(state._replace(key=key), params, action, key_env)
-            learner, metrics = jax.lax.scan(
-                partial(update, replay=state.replay), state.learner, jax.random.split(key_updates, cfg.updates)
-            )
+            state, reward, done = self.vector_step(state, params, action, keys_env)
+
+            def update(learner: LearnerState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[LearnerState, Any]:
+                bits, key = xs
+                return self.learner.update(learner, self.batch(state.replay, bits), key)
+
+            learner, metrics = jax.lax.scan(update, state.learner, (bits, keys_update))
             state = state._replace(learner=learner, noise=jnp.where(done, 0.0, explore))
             return state, {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
 
-        state, metrics = jax.lax.scan(step, state, None, steps // environments)
+        state, metrics = jax.lax.scan(step, state, xs)
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics if self.shards == 1 else jax.lax.pmean(metrics, AXIS)
 

@@ -28,7 +28,7 @@ def filled(replay: Replay, written: int):
 @pytest.mark.parametrize(("lead", "window"), [(0, 1), (4, 1), (4, 3)])
 def test_windows_equal_those_of_a_plain_ring(written, lead, window):
     replay = Replay(FIELDS, ENVIRONMENTS, STEPS, lead, window)
-    rows, valid = replay.sample(filled(replay, written), jax.random.key(written), 500)
+    rows, valid = replay.sample(filled(replay, written), jax.random.bits(jax.random.key(written), (500, 2)))
     chex.assert_shape([rows, valid], [(500, lead + window, 3), (500, lead + window)])
     kept = range(max(0, written - STEPS), written)
     seen = set()
@@ -51,7 +51,7 @@ def test_rows_are_float32_and_samples_have_the_default_float():
     replay = Replay(FIELDS, ENVIRONMENTS, STEPS, 2)
     state = filled(replay, 8)
     assert state.rows.dtype == jnp.float32
-    assert replay.sample(state, jax.random.key(0), 4)[0].dtype == jnp.zeros(()).dtype
+    assert replay.sample(state, jax.random.bits(jax.random.key(0), (4, 2)))[0].dtype == jnp.zeros(()).dtype
 
 
 def test_write_and_sample_are_the_same_under_jit():
@@ -59,9 +59,8 @@ def test_write_and_sample_are_the_same_under_jit():
     state = filled(replay, 33)
     row = jnp.asarray(rows_at(33))
     chex.assert_trees_all_equal(jax.jit(replay.write)(state, row), replay.write(state, row))
-    key = jax.random.key(3)
-    jitted = jax.jit(replay.sample, static_argnums=2)(state, key, 9)
-    chex.assert_trees_all_equal(jitted, replay.sample(state, key, 9))
+    bits = jax.random.bits(jax.random.key(3), (9, 2))
+    chex.assert_trees_all_equal(jax.jit(replay.sample)(state, bits), replay.sample(state, bits))
 
 
 def test_a_replay_shorter_than_its_windows_is_refused():

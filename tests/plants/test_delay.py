@@ -170,13 +170,15 @@ def test_window_of_a_line_written_in_blocks_is_what_single_reads_give(count: int
     lines = jnp.full((1, rows, len(lags)), jnp.nan)
     for block, part in enumerate(samples.reshape(-1, n)):
         lines = delay.write_block(lines, jnp.asarray(block), jnp.broadcast_to(part[None, :, None], (1, n, len(lags))))
-    window = delay.window(jnp.nan_to_num(lines[0], nan=9.0), jnp.asarray(len(samples)), lags, n)
+    lines, first = jnp.nan_to_num(lines[0], nan=9.0), jnp.asarray(len(samples))
+    window = product(delay.window(lines, first, lags, n))
     full = filled(np.concatenate([samples, np.zeros(n)]), rows=count + 2 * n)
     for i in range(n):
         newest = jnp.asarray(len(samples) + i)
         np.testing.assert_allclose(window[i], read_lanes(full, newest, lags), atol=1e-5)
-    for j, lag in enumerate(lags):
-        np.testing.assert_allclose(delay.window(lines[0, :, j], newest - n + 1, lag, n), window[:, j], atol=1e-6)
+    for j, lag in enumerate(lags):  # alone, and side by side with one lag
+        np.testing.assert_allclose(product(delay.window(lines[:, j], first, lag, n)), window[:, j], atol=1e-5)
+        np.testing.assert_allclose(product(delay.window(lines, first, lag, n))[:, j], window[:, j], atol=1e-5)
 
 
 @pytest.mark.parametrize("newest", [0, 3, 9, 20])
@@ -184,7 +186,15 @@ def test_held_window_is_what_single_reads_give(newest: int) -> None:
     n, lags = 10, jnp.array([10.0, 10.5, 23.7, 60.0])
     samples = np.random.default_rng(1).normal(size=newest + 1)
     line = jnp.nan_to_num(filled(samples), nan=9.0)
-    window = delay.held_window(jnp.broadcast_to(line[:, None], (ROWS, 4)), jnp.asarray(newest), lags, n)
+    lines, newest = jnp.broadcast_to(line[:, None], (ROWS, 4)), jnp.asarray(newest)
+    window = product(delay.held_window(lines, newest, lags, n))
     for i in range(n):
-        single = read_held_lanes(line, jnp.asarray(newest * n + i), lags, n)
-        np.testing.assert_allclose(window[i], single, atol=1e-5)
+        np.testing.assert_allclose(window[i], read_held_lanes(line, newest * n + i, lags, n), atol=1e-5)
+    for j, lag in enumerate(lags):
+        np.testing.assert_allclose(product(delay.held_window(line, newest, lag, n)), window[:, j], atol=1e-5)
+        np.testing.assert_allclose(product(delay.held_window(lines, newest, lag, n))[:, j], window[:, j], atol=1e-5)
+
+
+def product(window: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """Weights times rows."""
+    return jnp.tensordot(*window, 1)

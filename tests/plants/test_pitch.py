@@ -216,9 +216,10 @@ def test_whole_control_steps_agree_with_inner_steps(overrides: dict[str, float])
     np.testing.assert_allclose(whole, inner, rtol=0, atol=2e-5 * np.abs(inner).max())
 
 
-def test_plants_side_by_side_equal_lanes_under_vmap() -> None:
-    params = make("pitch")[1]
-    taus = jnp.array([0.105, 0.27, 0.5])
+@pytest.mark.parametrize("taus", [[0.105, 0.27, 0.5], 0.37], ids=["own-delays", "one-delay"])
+@pytest.mark.parametrize("d2", [0.0, 0.57])
+def test_plants_side_by_side_equal_lanes_under_vmap(taus: Any, d2: float) -> None:
+    params, taus = make("pitch", d2=d2)[1], jnp.asarray(taus)
     r_tilde = jax.random.uniform(KEY, (STEPS, 3), float, -30.0, 30.0)
     states = jax.vmap(PITCH.training_start, (0, None))(jax.random.split(KEY, 3), params)
     several = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), states)._replace(k=states.k[0])
@@ -232,7 +233,8 @@ def test_plants_side_by_side_equal_lanes_under_vmap() -> None:
         return jax.lax.scan(step, state, r_tilde)[1]
 
     lanes = jax.vmap(lambda tau, state, r: simulate(PITCH, params.replace(tau=tau), r, KEY, state), (0, 0, 1), 1)
-    chex.assert_trees_all_close(together(several, r_tilde), lanes(taus, states, r_tilde), atol=1e-4)
+    expected = lanes(jnp.broadcast_to(taus, (3,)), states, r_tilde)
+    chex.assert_trees_all_close(together(several, r_tilde), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("delays", [{"tau": 0.09}, {"tau": 0.61}, {"d1": 0.2}, {"d2": 0.0}], ids=str)

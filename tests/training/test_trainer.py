@@ -36,25 +36,25 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
     step = jax.jit(trainer.vector_step)
 
     @jax.jit
-    def without_reset(state, action, key):
-        keys = jax.vmap(lambda k: jax.random.split(k)[0])(jax.random.split(key, 8))  # as Environment.step splits them
+    def without_reset(state, action, keys):
         r_tilde = jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(state.prior, state.env.r, action)
         return jax.vmap(trainer.env.step_env, (0, 0, 0, None))(keys, state.env, r_tilde, params)
 
     seen = []  # (obs, action, reward, terminated, truncated, final observation) of each step
     for t in range(215):
         key = jax.random.key(t)
-        action = jax.random.uniform(key, (8,), minval=-1.0)
+        action, keys = jax.random.uniform(key, (8,), minval=-1.0), jax.random.split(key, 8)
         before = state.obs
-        final = without_reset(state, action, key)
-        state, reward, _ = step(state, params, action, key)
+        final = without_reset(state, action, keys)
+        state, reward, _ = step(state, params, action, keys)
         seen.append((before, action, reward, final[3], final[4], final[5]["final_observation"]))
     assert any(bool(ended.any()) for *_, ended, _ in seen)
     obs, action, reward, terminated, truncated, final = (np.asarray(jnp.stack(x)) for x in zip(*seen, strict=True))
     gamma = trainer.config.ddpg.discount
 
-    batch = trainer.batch(state.replay, jax.random.key(0))
-    rows, _ = trainer.replay.sample(state.replay, jax.random.key(0), trainer.config.ddpg.batch_size)
+    bits = jax.random.bits(jax.random.key(0), (trainer.config.ddpg.batch_size, 2))
+    batch = trainer.batch(state.replay, bits)
+    rows, _ = trainer.replay.sample(state.replay, bits)
     for i, row in enumerate(np.asarray(rows)):
         match = np.argwhere(np.isclose(action, row[trainer.replay.lead, FIELDS.index("action")], rtol=0, atol=0))
         t, e = match[0]
@@ -105,10 +105,11 @@ def test_same_seed_twice_is_bit_equal_and_another_seed_is_not():
 def test_vmapped_seeds_equal_single_runs():
     trainer, params = build(small())
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    states = jax.vmap(trainer.fresh, (0, None))(keys, params)
+    fresh = jax.jit(trainer.fresh)
+    states = jax.vmap(fresh, (0, None))(keys, params)
     both = jax.vmap(lambda s: trainer.epoch(trainer.prefill(s, params), params, 80)[0])(states)
     for i in range(2):
-        one = trainer.fresh(keys[i], params)
+        one = fresh(keys[i], params)
         one, _ = trainer.epoch(trainer.prefill(one, params), params, 80)
         lane = jax.tree.map(lambda leaf, i=i: leaf[i], both.learner)
         chex.assert_trees_all_close(lane, one.learner, atol=1e-4)
