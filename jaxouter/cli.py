@@ -46,6 +46,7 @@ def use_compilation_cache() -> None:
     """Keep compiled functions in the user's cache folder, unless JAX is told otherwise."""
     if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "xla"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
 
 
 def print_lists() -> None:
