@@ -301,6 +301,32 @@ def update(plant: str, name: str) -> Job:
     return training_job(repeated(run, state.learner, batch), trainer, config, updates, fused=False)
 
 
+def products(plant: str, name: str) -> Job:
+    """The matrix products of an update and nothing else: what is left of its rate is for everything else.
+
+    Five passes forward, the gradients of the weights of two networks, and of the inputs of their second layers.
+    """
+    trainer, _, config = training(plant, name)
+    batch, widths, updates = config.ddpg.batch_size, (trainer.learner.obs_size, *config.ddpg.hidden), 100
+    normal = partial(jax.random.normal, jax.random.key(0))
+    passes = [[normal((a, b)) * (i + 1.0) for a, b in pairwise(widths)] for i in range(5)]  # no two are the same
+    rows = [normal((batch, width)) for width in widths]
+
+    def run(small: jax.Array, passes: Any, rows: Any) -> tuple[jax.Array, None]:
+        def step(small: jax.Array, _: Any) -> tuple[jax.Array, None]:
+            x = [row + small for row in rows]
+            found = [x[i] @ weights[i] for weights in passes for i in range(len(weights))]
+            for sign in (1.0, -1.0):
+                found += [x[i].T @ (sign * rows[i + 1]) for i in range(len(widths) - 1)]
+                found += [(sign * rows[i + 1]) @ passes[0 if sign > 0 else 1][i].T for i in range(1, len(widths) - 1)]
+            return 1e-30 * sum((jnp.sum(product[:1, :1]) for product in found), jnp.zeros(())), None
+
+        return jax.lax.scan(step, small, None, updates)
+
+    call = repeated(run, jnp.zeros(()), passes, rows)
+    return training_job(call, trainer, config, updates, fused=False)
+
+
 def fused(plant: str, name: str, rows: int | None = None, devices: int = 1) -> Job:
     """Environment, replay and updates in one loop, as `jaxouter.train` runs them; one seed a device."""
     if devices > 1:
@@ -365,6 +391,8 @@ def cases() -> Iterator[tuple[str, Case]]:
     yield "fused/heaters-default", Case(partial(fused, "heaters", "default"))
     yield "update/paper", Case(partial(update, "pitch", "paper"), quick=True)
     yield "update/default", Case(partial(update, "pitch", "default"))
+    yield "products/paper", Case(partial(products, "pitch", "paper"))
+    yield "products/default", Case(partial(products, "pitch", "default"))
     for rows in (10_000, 100_000, 1_000_000):
         yield f"replay/{rows}", Case(partial(fused, "pitch", "paper", rows))
     for seeds in (1, 2, 4):

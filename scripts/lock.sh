@@ -3,5 +3,5 @@
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 "$PYTHON" -m pip --disable-pip-version-check install --quiet uv
-"$PYTHON" -m uv pip compile --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --all-extras \
+"$PYTHON" -m uv pip compile --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --extra dev \
     --no-header --no-annotate --upgrade --quiet pyproject.toml --output-file requirements.lock

@@ -80,7 +80,9 @@ def window(line: jax.Array, first: jax.Array, lag: jax.Array, n: int) -> tuple[j
     if line.ndim > 1 and lag.ndim == 0:
         weights = jnp.eye(n, n + 1) * (1.0 - share) + jnp.eye(n, n + 1, 1) * share
         return jnp.where(start + _column(start, n, 2) < 0, 0.0, weights), past
-    value = past[:-1] + (past[1:] - past[:-1]) * _raise(share, line.ndim)
+    share = _raise(share, line.ndim)
+    # On the grid the next sample may not be written yet: what stands in its row is older, and perhaps not finite.
+    value = past[:-1] + jnp.where(share > 0.0, (past[1:] - past[:-1]) * share, 0.0)
     number = _raise(start, line.ndim) + _column(start, n, line.ndim)
     return jnp.eye(n), jnp.where(number < 0, 0.0, value)
 
@@ -149,7 +151,9 @@ def held_window(line: jax.Array, newest: jax.Array, lag: jax.Array, n: int) -> t
     ndim = 2 if side_by_side else line.ndim
     # The share of each interval that lies in the later hold.
     share = jnp.clip(_column(lag, n, ndim) + 1.0 - n * _raise(1.0 - (whole - lag), ndim), 0.0, 1.0)
-    before, begun = (jnp.where(_raise(i, ndim) < 0, 0.0, 1.0) for i in (first, first + 1))
+    before, not_yet = (_raise(i, ndim) < 0 for i in (first, first + 1))  # before the start: zero
     if side_by_side:
-        return jnp.concatenate([before * (1.0 - share), begun * share], 1), jnp.concatenate([earlier, later])
-    return jnp.eye(n), before * earlier + (begun * later - before * earlier) * share
+        weights = [jnp.where(before, 0.0, 1.0 - share), jnp.where(not_yet, 0.0, share)]
+        return jnp.concatenate(weights, 1), jnp.concatenate([earlier, later])
+    earlier, later = jnp.where(before, 0.0, earlier), jnp.where(not_yet, 0.0, later)
+    return jnp.eye(n), earlier + (later - earlier) * share

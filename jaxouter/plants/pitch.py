@@ -68,9 +68,7 @@ class PitchState(NamedTuple):
     x: jax.Array  # (4,), [u ft/s, w ft/s, q crad/s, theta crad]
     xc: jax.Array  # integral of theta - c, crad s
     xi: jax.Array  # pilot
-    lines: (
-        jax.Array
-    )  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step; only of the late ones, if told
+    lines: jax.Array  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step; of the late ones, if told
     r_tilde_line: jax.Array  # (M,), delay line of r~, a sample a control step
     k: jax.Array  # int32, control steps since the start
 
