@@ -3,13 +3,15 @@
     python benchmarks/slower.py BEFORE.json AFTER.json [--tolerance 0.1]
 
 Compared are the ratios to the yardsticks where there are any, so that another machine, or the same one on another day,
-is no difference; otherwise the medians. A case changed if its figure moved by more than the tolerance and each median
-lies outside the other's range from least to greatest. Ends with status 1 if something became slower.
+is no difference; otherwise the medians; of one machine both, and the smaller change counts, since a yardstick drifts
+too. A case changed if its figure moved by more than the tolerance and each median lies outside the other's range from
+least to greatest. Ends with status 1 if something became slower.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,25 +38,36 @@ def figure(row: dict[str, Any], by_ratio: bool) -> Figure:
     return Figure(1 / high, 1 / middle, 1 / low) if row["unit"] in LESS_IS_BETTER else Figure(low, middle, high)
 
 
-def change(before: dict[str, Any], after: dict[str, Any], tolerance: float) -> tuple[float, bool]:
+def change(
+    before: dict[str, Any], after: dict[str, Any], tolerance: float, same_machine: bool = False
+) -> tuple[float, bool]:
     """How many times as good the second row is, and whether that is more than chance."""
     by_ratio = before["ratio"] is not None and after["ratio"] is not None
+    found = [_compared(before, after, tolerance, by_ratio)]
+    if by_ratio and same_machine:
+        found.append(_compared(before, after, tolerance, False))
+    factor = min((factor for factor, _ in found), key=lambda factor: abs(math.log(factor)))
+    return factor, all(real for _, real in found) and len({factor > 1 for factor, _ in found}) == 1
+
+
+def _compared(before: dict[str, Any], after: dict[str, Any], tolerance: float, by_ratio: bool) -> tuple[float, bool]:
     a, b = figure(before, by_ratio), figure(after, by_ratio)
     apart = not a.low <= b.middle <= a.high and not b.low <= a.middle <= b.high
     factor = b.middle / a.middle
     return factor, apart and not 1 - tolerance <= factor <= 1 / (1 - tolerance)
 
 
-def rows(path: Path) -> dict[str, dict[str, Any]]:
-    """Rows of a results file by case.
+def rows(path: Path) -> tuple[dict[str, dict[str, Any]], Any]:
+    """Rows of a results file by case, and the processor and number of cores that they are of.
 
     Raises:
         ValueError: it is none.
     """
     try:
         content = json.loads(path.read_text())
-        return {row["case"]: row for row in content["rows"]}
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+        machine = content.get("machine") or {}
+        return {row["case"]: row for row in content["rows"]}, (machine.get("cpu"), machine.get("cores"))
+    except (OSError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is not a results file of benchmarks/throughput.py ({error!r})") from None
 
 
@@ -68,8 +81,9 @@ def main(before: tyro.conf.Positional[Path], after: tyro.conf.Positional[Path], 
     """
     if not 0 <= tolerance < 1:
         raise ValueError(f"--tolerance is {tolerance}; it must lie in [0, 1)")
-    old, new = rows(before), rows(after)
-    changes = {case: change(old[case], new[case], tolerance) for case in old if case in new}
+    (old, old_machine), (new, new_machine) = rows(before), rows(after)
+    same = old_machine == new_machine != (None, None)
+    changes = {case: change(old[case], new[case], tolerance, same) for case in old if case in new}
     slower = {case: factor for case, (factor, real) in changes.items() if real and factor < 1}
     faster = {case: factor for case, (factor, real) in changes.items() if real and factor > 1}
     for word, those in (("slower", slower), ("faster", faster)):

@@ -85,6 +85,13 @@ def test_a_change_is_beyond_tolerance_and_range(before, after, factor, real):
     assert slower.change(before, after, 0.1) == (pytest.approx(factor), real)
 
 
+def test_yardstick_that_drifts_is_no_change_on_one_machine():
+    before, after = row(100, 95, 105, 0.5), row(100, 95, 105, 0.4)
+    assert slower.change(before, after, 0.1) == (pytest.approx(0.8), True)
+    assert slower.change(before, after, 0.1, same_machine=True) == (pytest.approx(1.0), False)
+    assert slower.change(before, row(70, 69, 71, 0.3), 0.1, same_machine=True) == (pytest.approx(0.7), True)
+
+
 def test_slower_names_cases_and_sets_the_status(tmp_path, capsys):
     before, after = tmp_path / "before.json", tmp_path / "after.json"
     before.write_text(json.dumps({"rows": [row(100, 99, 101), row(1, 1, 1) | {"case": "gone"}]}))
