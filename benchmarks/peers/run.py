@@ -110,7 +110,7 @@ def measure(library: str, updates: int, windows: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("library", choices=list(PACKAGES))
+    parser.add_argument("peer", choices=list(PACKAGES))
     parser.add_argument("--updates", type=int, default=1000, help="updates of each window (default: %(default)s)")
     parser.add_argument("--windows", type=int, default=5, help="windows to measure (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
@@ -118,7 +118,7 @@ def main() -> None:
     for name in ("updates", "windows"):
         if getattr(options, name) < 1:
             parser.error(f"--{name} is {getattr(options, name)}; it must be at least 1")
-    row = measure(options.library, options.updates, options.windows)
+    row = measure(options.peer, options.updates, options.windows)
     if options.json:
         print(json.dumps(row))
     else:
