@@ -63,6 +63,13 @@ class Replay:
         buffer = jax.lax.dynamic_update_slice(buffer, slab, (0, twin, 0))
         return ReplayState(buffer, state.written + 1)
 
+    def take_back(self, state: ReplayState) -> tuple[ReplayState, jax.Array]:
+        """The state without the rows (E, width) of the last `write`, and these; writing them again gives it back."""
+        position = (state.written - 1) % self.steps + self.mirror
+        size = (self.environments, 1, len(self.fields))
+        rows = jax.lax.dynamic_slice(state.rows, (0, position, 0), size)[:, 0]
+        return state._replace(written=state.written - 1), rows
+
     def sample(self, state: ReplayState, bits: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.
 

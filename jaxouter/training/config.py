@@ -91,8 +91,10 @@ class TrainConfig:
                 f"prefill is {self.prefill}; it must lie between the batch size, {self.ddpg.batch_size}, "
                 f"and the {self.steps} steps"
             )
-        if self.prefill < self.ddpg.n_step * self.environments:
-            raise ValueError(f"prefill is {self.prefill}; it must hold ddpg.n_step = {self.ddpg.n_step} steps of each")
+        if self.prefill <= self.ddpg.n_step * self.environments:
+            raise ValueError(
+                f"prefill is {self.prefill}; it must hold more than ddpg.n_step = {self.ddpg.n_step} steps of each"
+            )
         if self.replay < self.ddpg.batch_size:
             raise ValueError(f"replay is {self.replay}; it must hold at least a batch of {self.ddpg.batch_size}")
         if not 0 <= self.redraw <= 1 or not 0 < self.noise_theta <= 1:

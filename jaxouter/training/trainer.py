@@ -111,11 +111,12 @@ class Trainer:
 
     def vector_step(
         self, state: TrainState, params: EnvParams, action: jax.Array, keys: chex.PRNGKey
-    ) -> tuple[TrainState, jax.Array, jax.Array]:
-        """Every environment takes one step with its action (E,) and key (E,), and its row goes into the replay.
+    ) -> tuple[TrainState, jax.Array, jax.Array, jax.Array]:
+        """Every environment takes one step with its action (E,) and key (E,).
 
         Returns:
-            The state, rewards (E,) as the plant gives them, and whether each episode ended (E,).
+            The state, rows (E, width) for the replay, rewards (E,) as the plant gives them, and whether each episode
+            ended (E,).
         """
         before = state.env
         r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.prior, before.r, action)
@@ -136,10 +137,9 @@ class Trainer:
         state = state._replace(
             env=env,
             obs=obs,
-            replay=self.replay.write(state.replay, row),
             steps=state.steps + self.config.environments * self.shards,
         )
-        return state, reward, terminated | truncated
+        return state, row, reward, terminated | truncated
 
     def batch(self, replay: ReplayState, bits: jax.Array) -> Batch:
         """A batch of transitions, built from windows of signals, drawn by random bits (B, 2), uint32."""
@@ -170,7 +170,8 @@ class Trainer:
         actions = jnp.take_along_axis(fresh, held, 0)
 
         def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, None]:
-            return self.vector_step(state, params, *xs)[0], None
+            state, rows, *_ = self.vector_step(state, params, *xs)
+            return state._replace(replay=self.replay.write(state.replay, rows)), None
 
         return jax.lax.scan(step, state, (actions, self._keys_env(keys_env)))[0]
 
@@ -181,6 +182,8 @@ class Trainer:
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """`steps` environment steps (over all environments of all shards) of exploration and learning.
+
+        The updates of a step draw from the rows of all steps before it. The replay must not be empty.
 
         Returns:
             The state, and means over the epoch: the learner's metrics and `reward` (a step, with exploration).
@@ -202,23 +205,29 @@ class Trainer:
             jax.vmap(lambda key: jax.random.split(key, cfg.updates))(keys_update),
         )
 
-        def step(state: TrainState, xs: Any) -> tuple[TrainState, dict[str, jax.Array]]:
+        # The rows of a step are written as the next one begins: so environments and updates need nothing of each other
+        # within a step, and run at the same time.
+        def step(carry: tuple[TrainState, jax.Array], xs: Any) -> tuple[Any, dict[str, jax.Array]]:
+            state, rows = carry
             normal, keys_env, bits, keys_update = xs
+            learner, replay = state.learner, self.replay.write(state.replay, rows)
             progress = state.steps.astype(float) / cfg.steps
             volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
             explore = noise.ornstein_uhlenbeck(state.noise, normal, cfg.noise_theta, volatility)
-            action = jnp.clip(self.learner.act(state.learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
-            state, reward, done = self.vector_step(state, params, action, keys_env)
+            action = jnp.clip(self.learner.act(learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
+            state, rows, reward, done = self.vector_step(state, params, action, keys_env)
 
             def update(learner: LearnerState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[LearnerState, Any]:
                 bits, key = xs
-                return self.learner.update(learner, self.batch(state.replay, bits), key)
+                return self.learner.update(learner, self.batch(replay, bits), key)
 
-            learner, metrics = jax.lax.scan(update, state.learner, (bits, keys_update))
-            state = state._replace(learner=learner, noise=jnp.where(done, 0.0, explore))
-            return state, {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
+            learner, metrics = jax.lax.scan(update, learner, (bits, keys_update))
+            state = state._replace(learner=learner, replay=replay, noise=jnp.where(done, 0.0, explore))
+            return (state, rows), {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
 
-        state, metrics = jax.lax.scan(step, state, xs)
+        replay, rows = self.replay.take_back(state.replay)
+        (state, rows), metrics = jax.lax.scan(step, (state._replace(replay=replay), rows), xs)
+        state = state._replace(replay=self.replay.write(state.replay, rows))
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics if self.shards == 1 else jax.lax.pmean(metrics, AXIS)
 

@@ -63,6 +63,16 @@ def test_write_and_sample_are_the_same_under_jit():
     chex.assert_trees_all_equal(jax.jit(replay.sample)(state, bits), replay.sample(state, bits))
 
 
+@pytest.mark.parametrize("written", [1, 4, 20, 24, 33])
+def test_what_is_taken_back_and_written_again_changes_nothing(written):
+    replay = Replay(FIELDS, ENVIRONMENTS, STEPS, 4)
+    state = filled(replay, written)
+    before, rows = replay.take_back(state)
+    np.testing.assert_array_equal(rows, rows_at(written - 1))
+    assert int(before.written) == written - 1
+    chex.assert_trees_all_equal(replay.write(before, rows), state)
+
+
 def test_a_replay_shorter_than_its_windows_is_refused():
     with pytest.raises(ValueError, match=r"keeps 10 steps.*more than 10"):
         Replay(FIELDS, ENVIRONMENTS, 10, 5)

@@ -33,7 +33,7 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
     """Windows of signals rebuild exactly what was seen, across resets, truncation and the ring's end included."""
     trainer, params = build(small(n_step=n_step, epoch=800, steps=1_600, replay=960))
     state = trainer.start(0, params)
-    step = jax.jit(trainer.vector_step)
+    step, write = jax.jit(trainer.vector_step), jax.jit(trainer.replay.write)
 
     @jax.jit
     def without_reset(state, action, keys):
@@ -46,7 +46,8 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
         action, keys = jax.random.uniform(key, (8,), minval=-1.0), jax.random.split(key, 8)
         before = state.obs
         final = without_reset(state, action, keys)
-        state, reward, _ = step(state, params, action, keys)
+        state, rows, reward, _ = step(state, params, action, keys)
+        state = state._replace(replay=write(state.replay, rows))
         seen.append((before, action, reward, final[3], final[4], final[5]["final_observation"]))
     assert any(bool(ended.any()) for *_, ended, _ in seen)
     obs, action, reward, terminated, truncated, final = (np.asarray(jnp.stack(x)) for x in zip(*seen, strict=True))
