@@ -112,6 +112,8 @@ class TrainingProgress:
     def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
         """Show the row of an epoch."""
         cfg, epoch, now = self._config, row["epoch"], time.monotonic()
+        if epoch == 0:
+            return self._show(seed, f"pretrained  MAE {row['mae']:.3f} {self._unit}")
         text = (
             f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
             f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {row['mae']:.3f} {self._unit}"
@@ -125,6 +127,21 @@ class TrainingProgress:
             left = (now - self._begin) / max(1, epoch - self._first) * (cfg.epochs - epoch)
             print(f"seed {seed}  epoch {epoch}/{cfg.epochs}  {text}  {left:.0f} s left", flush=True)
             self._last = now
+
+    def pretrained(self, seed: int, done: int) -> None:
+        """Show how many gradient steps of the start are done."""
+        now = time.monotonic()
+        if console.is_terminal or now - self._last >= LINE_SECONDS:
+            self._show(seed, f"pretraining: {done:,} of {self._config.pretraining.gradient_steps:,} gradient steps")
+            self._last = now
+
+    def _show(self, seed: int, text: str) -> None:
+        if not console.is_terminal:
+            print(f"seed {seed}  {text}", flush=True)
+            return
+        if seed not in self._tasks:
+            self._tasks[seed] = self._bars.add_task("", total=self._config.epochs, seed=seed, text="")
+        self._bars.update(self._tasks[seed], text=text)
 
 
 class JobProgress:

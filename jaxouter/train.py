@@ -102,7 +102,7 @@ def main(arguments: list[str] | None = None) -> None:
                 return {"mae": mae(traces)}
 
             with cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
-                finals = train(run, watch, progress, lambda: interrupt.requested)
+                finals = train(run, watch, progress, lambda: interrupt.requested, progress.pretrained)
         devices.part()
     if finals is None:
         if first:
@@ -126,9 +126,10 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
+        "training_seconds": sum(row.get("seconds", 0.0) for seed in run.seeds for row in run.rows(seed))
         / run.config.side_by_side,
-        "steps": run.config.steps,
+        "steps": run.config.steps if run.config.epochs else 0,
+        "identification_steps": run.config.identification_episodes * met[0].plant.episode_steps,
         "updates": run.config.total_updates,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
@@ -148,7 +149,8 @@ def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], le
     levels |= {"paper's DRL": met[0].paper[1]} if met[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
     title = f"{met[0].id}, MAE [{met[0].plant.y_unit}]"
-    figures.learning_curve(run.figures / "learning-curve.png", rows, levels, title)
+    if run.config.epochs:
+        figures.learning_curve(run.figures / "learning-curve.png", rows, levels, title)
     return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
 
 

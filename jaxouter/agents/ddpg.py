@@ -47,6 +47,8 @@ class DDPGConfig:
     """TD3: two critics, the smaller value is the target."""
     policy_delay: int = 1
     """TD3: the actor and the targets move at every so many critic updates."""
+    actor_from: int = 0
+    """Updates of the critic alone before the actor moves too: a critic that knows nothing would spoil a good actor."""
     target_noise: float = 0.0
     """TD3: standard deviation of the noise on the target action."""
     target_noise_clip: float = 0.5
@@ -55,7 +57,7 @@ class DDPGConfig:
     def check(self) -> None:
         """Raises ValueError, naming field, value and what is allowed."""
         positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay")
-        not_negative = ("critic_l2", "saturation_penalty", "target_noise", "target_noise_clip")
+        not_negative = ("critic_l2", "saturation_penalty", "actor_from", "target_noise", "target_noise_clip")
         for field in positive:
             if not getattr(self, field) > 0:
                 raise ValueError(f"ddpg.{field} is {getattr(self, field)}; it must be positive")
@@ -166,7 +168,10 @@ class DDPG:
     @property
     def actor_optimiser(self) -> optax.GradientTransformation:
         """Adam."""
-        return adam(self._rate(self.config.actor_rate))
+        rate, first = self._rate(self.config.actor_rate), self.config.actor_from
+        if first == 0:
+            return adam(rate)
+        return adam(lambda steps: jnp.where(jnp.asarray(steps) < first, 0.0, rate(steps) if callable(rate) else rate))
 
     @property
     def critic_optimiser(self) -> optax.GradientTransformation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -195,7 +196,7 @@ def learning_curve(
     for seed, of_seed in rows.items():
         steps = [row["steps"] / 1000 for row in of_seed]
         left.plot(steps, [row["mae"] for row in of_seed], lw=1.6, label=f"learned, seed {seed}")
-        right.plot(steps, [row["reward"] for row in of_seed], lw=1.6, label=f"seed {seed}")
+        right.plot(steps, [row.get("reward", math.nan) for row in of_seed], lw=1.6, label=f"seed {seed}")
     for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
         left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
     left.set_ylabel("MAE without exploration")

@@ -35,6 +35,24 @@ def telegraph(key: chex.PRNGKey, steps: int, low: float, high: float, redraw: ja
     return levels[jax.lax.cummax(jnp.where(when, jnp.arange(steps), 0))]
 
 
+def redrawn(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
+    """Reference of a training episode, (steps,): set-points in [low, high], redrawn at random times.
+
+    A third of the episodes keep one set-point. In a third it is redrawn, with a probability that is log-uniform from
+    one to twenty times an episode. In a third it is redrawn at each step near the one before: a random walk, reflected
+    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range.
+    """
+    key_kind, key_rate, key_run = jax.random.split(key, 3)
+    share = jax.random.uniform(key_rate, (), float)
+    rate = 20.0**share / steps
+    first = telegraph(key_run, steps, low, high, 0.0)
+    moves = 0.0025 * 20.0**share * jax.random.normal(key_run, (steps,), float)
+    walk = (first[0] - low) / (high - low) + jnp.cumsum(moves)
+    reflected = low + (high - low) * jnp.abs((walk + 1.0) % 2.0 - 1.0)
+    kind = jax.random.randint(key_kind, (), 0, 3)
+    return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected])[kind]
+
+
 def staircase(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
     """Five set-points, each held equally long."""
     levels = jax.random.uniform(key, (SEGMENTS,), float, low, high)

@@ -10,6 +10,29 @@ import tyro
 
 from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
+from jaxouter.loop.identify import LEVELS
+
+
+@dataclass(frozen=True)
+class PretrainingConfig:
+    """A start by analytic policy gradient on a model identified from recorded episodes, before the learner begins."""
+
+    gradient_steps: int = 0
+    """Gradient steps of the actor on the identified model; 0: no such start."""
+    episodes: int = 64
+    """Episodes of the plant that are recorded under random r~, besides --steps."""
+    lags: int = 15
+    """Past samples of r~ and y in the model."""
+    batch_size: int = 64
+    """Episodes of the model a gradient step."""
+
+    def check(self) -> None:
+        """Raises ValueError, naming field, value and what is allowed."""
+        if self.gradient_steps < 0:
+            raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
+        for name in ("episodes", "lags", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -28,7 +51,7 @@ class TrainConfig:
     """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
     spans several, which share its environments, replay and batch, and then draw otherwise than one."""
     steps: int = 200_000
-    """Environment steps in all, over all environments, prefill included."""
+    """Environment steps in all, over all environments, prefill included; equal to it, the pretrained actor stays."""
     environments: int = 1
     """Environments that roll out in parallel."""
     updates: int = 1
@@ -55,6 +78,8 @@ class TrainConfig:
     """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
     noise_end: float = 1.0
     """Factor on the volatility at the end of training, reached linearly."""
+    pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
+    """The start."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     """The learner."""
 
@@ -65,6 +90,7 @@ class TrainConfig:
             ValueError: names the field, its value and what is allowed.
         """
         plants.resolve(self.plant)
+        self.pretraining.check()
         self.ddpg.check()
         for name in ("seeds", "devices", "steps", "environments", "updates", "epoch", "reward_scale"):
             if not getattr(self, name) > 0:
@@ -86,7 +112,8 @@ class TrainConfig:
                     f"{name} is {value}; it must be a multiple of the {self.shards} devices that each of the "
                     f"{self.seeds} seeds gets of {self.devices}"
                 )
-        if not self.ddpg.batch_size <= self.prefill < self.steps:
+        most = self.steps - (0 if self.pretraining.gradient_steps else 1)  # what is pretrained may stay as it is
+        if not self.ddpg.batch_size <= self.prefill <= most:
             raise ValueError(
                 f"prefill is {self.prefill}; it must lie between the batch size, {self.ddpg.batch_size}, "
                 f"and the {self.steps} steps"
@@ -124,6 +151,12 @@ class TrainConfig:
         return -(-(self.steps - self.prefill) // self.epoch)
 
     @property
+    def identification_episodes(self) -> int:
+        """Episodes recorded before the training, of each seed."""
+        recorded = self.pretraining.episodes if self.pretraining.gradient_steps else 0
+        return recorded + (LEVELS if self.residual else 0)
+
+    @property
     def total_updates(self) -> int:
         """Gradient updates of one seed."""
         return (self.steps - self.prefill) // self.environments * self.updates
@@ -157,8 +190,15 @@ DEFAULT = TrainConfig(
         saturation_penalty=1e-3,
     ),
 )
+PRETRAINED = replace(
+    DEFAULT,
+    preset="pretrained",
+    steps=8_000,
+    prefill=8_000,
+    pretraining=PretrainingConfig(gradient_steps=1_000),
+)
 PRESETS: dict[str, dict[str, TrainConfig]] = {
-    "pitch": {"default": DEFAULT, "paper": PAPER},
+    "pitch": {"default": DEFAULT, "paper": PAPER, "pretrained": PRETRAINED},
     "heaters": {
         "default": replace(
             DEFAULT,
@@ -169,6 +209,14 @@ PRESETS: dict[str, dict[str, TrainConfig]] = {
             ddpg=replace(DEFAULT.ddpg, discount=0.95),
         ),
         "paper": replace(PAPER, plant="heaters", steps=400_000),
+        "pretrained": replace(
+            PRETRAINED,
+            plant="heaters",
+            integral_steps=None,
+            reward_scale=1.0,
+            pretraining=replace(PRETRAINED.pretraining, lags=5),
+            ddpg=replace(DEFAULT.ddpg, discount=0.95),
+        ),
     },
 }
 
@@ -204,5 +252,9 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
             raise ValueError(f"the configuration has fields {sorted(set(values) ^ names)} missing or unknown")
         return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
 
-    # Runs of versions that knew one device only go on as they were.
-    return build(TrainConfig, {"devices": 1, **values, "ddpg": build(DDPGConfig, values.get("ddpg", {}))})
+    # Runs of versions that knew one device only, and no pretraining, go on as they were.
+    nested = {
+        "pretraining": build(PretrainingConfig, values.get("pretraining", dataclasses.asdict(PretrainingConfig()))),
+        "ddpg": build(DDPGConfig, {"actor_from": 0, **values.get("ddpg", {})}),
+    }
+    return build(TrainConfig, {"devices": 1, **values, **nested})

@@ -15,6 +15,11 @@ from jaxouter.training.trainer import Trainer, TrainState
 Row = dict[str, Any]
 OnEpoch = Callable[[Trainer, TrainState], Row]
 Report = Callable[[int, Row], None]
+Pretrained = Callable[[int, int], None]
+
+
+class _StoppedError(Exception):
+    """Asked to end early before there was anything to save."""
 
 
 def train(
@@ -22,6 +27,7 @@ def train(
     on_epoch: OnEpoch = lambda trainer, state: {},
     report: Report = lambda seed, row: None,
     stop: Callable[[], bool] = lambda: False,
+    pretrained: Pretrained = lambda seed, done: None,
 ) -> dict[int, TrainState] | None:
     """Train every seed of a run to the end, from the newest epoch of which all have a checkpoint, or from the start.
 
@@ -33,6 +39,7 @@ def train(
         on_epoch: called with trainer and state after each epoch; what it returns joins the row (evaluation).
         report: called with seed and row after each epoch (progress).
         stop: asked after each epoch whether to end early; everything is saved then. All processes end if one does.
+        pretrained: called with seed and gradient steps done as the actor is pretrained (progress).
 
     Returns:
         The final state of each seed, on the host; None where it ended early.
@@ -43,7 +50,24 @@ def train(
     cfg, fleet, (trainer, params) = run.config, run.fleet, run.trainer
     done = int(devices.text_from_first(lambda: str(run.common_epoch())))
     rounds = [run.seeds[i : i + cfg.side_by_side] for i in range(0, cfg.seeds, cfg.side_by_side)]
-    states = {seeds: _begin(run, seeds, done) for seeds in rounds}
+
+    def heard(seed: int, gradient_steps: int) -> None:
+        pretrained(seed, gradient_steps)
+        if jax.process_count() == 1 and stop():
+            raise _StoppedError
+
+    try:
+        states = {seeds: _begin(run, seeds, done, heard) for seeds in rounds}
+    except _StoppedError:
+        return None
+    if cfg.pretraining.gradient_steps and not done:
+        for seeds in rounds:  # what the start gave is the row of epoch 0
+            for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True):
+                if devices.is_first() and not run.rows(seed):
+                    row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state)}
+                    run.append(seed, row)
+                    run.save(seed, 0, state)
+                    report(seed, row)
     for epoch in range(done, cfg.epochs):
         steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
         for seeds in rounds:
@@ -72,14 +96,16 @@ def train(
     return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
 
 
-def _begin(run: Run, seeds: range, done: int) -> TrainState:
-    """States of some seeds after so many epochs: from their checkpoints, or prefilled."""
+def _begin(run: Run, seeds: range, done: int, pretrained: Pretrained) -> TrainState:
+    """States of some seeds after so many epochs: from their checkpoints, or started and prefilled."""
     trainer, params = run.trainer
     like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
+    kept = [seed for seed in seeds if done in run.checkpoints(seed)] if devices.is_first() else []
+    loads = devices.any_process(len(kept) == len(seeds))
 
     def whole(seed: int) -> TrainState:
-        run.forget(seed, done)
-        return run.load(seed, done)[0] if done else trainer.start(seed, params)
+        run.forget(seed, done if loads else -1)
+        return run.load(seed, done)[0] if loads else trainer.start(seed, params, lambda n: pretrained(seed, n))
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
-    return states if done else run.fleet.prefill(states, params)
+    return states if loads or not run.config.epochs else run.fleet.prefill(states, params)

@@ -6,6 +6,7 @@ donated. Plain Python between them draws progress, evaluates and saves.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,9 +26,11 @@ from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
+from jaxouter.training.pretraining import pretrain
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
 AXIS = "environments"  # over the shards of a learner
+PRETRAINING = 1  # folded into a key
 HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
 
 
@@ -62,8 +65,11 @@ class Trainer:
         """The learner inside the policy."""
         return self.policy.learner
 
-    def start(self, seed: int, params: EnvParams) -> TrainState:
-        """State before the prefill; the static prefilter is identified where the policy is its residual.
+    def start(self, seed: int, params: EnvParams, report: Callable[[int], None] = lambda done: None) -> TrainState:
+        """State before the prefill.
+
+        The static prefilter is identified where the policy is its residual, and the actor pretrained where that is
+        configured; `report` is called with the gradient steps done.
 
         Raises:
             ValueError: the identification failed.
@@ -71,7 +77,14 @@ class Trainer:
         key_prior, key = jax.random.split(jax.random.key(seed))
         state = self._fresh(key, params)
         if self.config.residual:
-            return state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
+            state = state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
+        if self.config.pretraining.gradient_steps:
+            key_start = jax.random.fold_in(key_prior, PRETRAINING)
+            actor = pretrain(
+                self.config.pretraining, self.env.plant, params.plant, self.policy, state.prior, key_start, report
+            )
+            target = jax.tree.map(jnp.copy, actor)  # the state is donated, and no buffer twice
+            state = state._replace(learner=state.learner._replace(actor=actor, target_actor=target))
         return state
 
     @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)

@@ -8,43 +8,25 @@ from typing import Any
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import sensor
 from jaxouter.loop.policy import Policy
-from jaxouter.loop.references import telegraph
+from jaxouter.loop.references import redrawn
 from jaxouter.plants import Plant
 
 EPISODES = 16
 Report = Callable[[str], None]
 
 
-def set_points(key: chex.PRNGKey, plant: Plant, steps: int) -> jax.Array:
-    """Reference of a training episode, (steps,): set-points of the plant's range, redrawn at random times.
-
-    A third of the episodes keep one set-point. In a third it is redrawn, with a probability that is log-uniform from
-    one to twenty times an episode. In a third it is redrawn at each step near the one before: a random walk, reflected
-    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range.
-    """
-    key_kind, key_rate, key_run = jax.random.split(key, 3)
-    low, high = plant.setpoint_range
-    share = jax.random.uniform(key_rate, (), float)
-    rate = 20.0**share / plant.episode_steps
-    first = telegraph(key_run, steps, low, high, 0.0)
-    moves = 0.0025 * 20.0**share * jax.random.normal(key_run, (steps,), float)
-    walk = (first[0] - low) / (high - low) + jnp.cumsum(moves)
-    reflected = low + (high - low) * jnp.abs((walk + 1.0) % 2.0 - 1.0)
-    kind = jax.random.randint(key_kind, (), 0, 3)
-    return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected])[kind]
-
-
 def training_episodes(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES) -> Scenario:
     """Episodes of the training distribution (spec section 5) as a scenario."""
     key_r, key_draw, key_run = jax.random.split(key, 3)
-    r = jax.vmap(lambda key: set_points(key, plant, plant.episode_steps))(jax.random.split(key_r, episodes))
+    r = jax.vmap(lambda key: redrawn(key, plant.episode_steps, *plant.setpoint_range))(
+        jax.random.split(key_r, episodes)
+    )
     draw = plant.draw or (lambda key, params: params)
     return Scenario(
         id=f"{plant.name}/training",

@@ -7,10 +7,10 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.evaluation.rivals import mpc, oracle, pi
-from jaxouter.evaluation.rivals.oracle import Whitening, folded
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import identify
 from jaxouter.training.policy import LearnedParams
+from jaxouter.training.pretraining import Whitening, folded
 from tests import lag
 
 KEY = jax.random.key(0)
@@ -73,7 +73,7 @@ def test_built_policy_is_the_one_that_was_chosen(tuned, school):
     assert policy == school.policy
     key = jax.random.split(KEY, 5)[4]
     one = jax.tree.map(lambda leaf: leaf[None], params.actor)
-    value = school.returns(one, params.prior, lag.make()[1], key)
+    value = oracle.returns(school, one, params.prior, lag.make()[1], key)
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
 
 
