@@ -1,0 +1,108 @@
+"""What was tried on the way to the presets, and what it gave: benchmarks/results/learning.md.
+
+    python scripts/sweep.py                             # train what is not there yet, write the table
+    python scripts/sweep.py --seeds 5 --only pretrained
+
+Each line of the table is one command of `python -m jaxouter.train`; its run folder is runs/sweep/PLANT-NAME. The
+columns are the scenarios with the plant of the training, the median over the seeds of the MAE.
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import subprocess
+import sys
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import jax
+import tyro
+
+from jaxouter import cli, plants
+from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.evaluate import Named, evaluate
+from jaxouter.training.run import Run
+
+RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
+SHORT = ("--steps", "38000", "--ddpg.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "pretrained": ("--preset", "pretrained"),
+    "pretrained-500": ("--preset", "pretrained", "--pretraining.gradient-steps", "500"),
+    "pretrained-16-episodes": ("--preset", "pretrained", "--pretraining.episodes", "16"),
+    "then-ddpg-3e-5": ("--preset", "pretrained", *SHORT, "--ddpg.actor-rate", "3e-5"),
+    "then-ddpg-3e-6": ("--preset", "pretrained", *SHORT, "--ddpg.actor-rate", "3e-6"),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train every variant on both plants, and write the table of what each gave."""
+
+    seeds: int = 2
+    """Seeds of the runs that are not there yet."""
+    only: tuple[str, ...] = tuple(VARIANTS)
+    """Variants to train; the table has all whose run folder is there."""
+    runs: Path = Path("runs/sweep")
+    """Where the run folders are."""
+
+
+def nominal(plant: str) -> list[str]:
+    """The paper's own scenarios on the plant of the training, and the families."""
+    first = ["pitch/paper"] if plant == "pitch" else scenarios.paper_scenarios(plant)
+    return first + [f"{plant}/{family}" for family in plants.make(plant)[0].families]
+
+
+def line(name: str, run: Run) -> list[str]:
+    """Variant, seeds, median MAE of each scenario, and seconds a seed, start included."""
+    trainer, _ = run.trainer
+    met = [scenarios.get(identifier) for identifier in nominal(run.config.plant)]
+    policies = [Named("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
+    found = [evaluate(policy, met) for policy in policies]
+    of_each = [[results[scenario.id][1]["mae"] for results in found] for scenario in met]
+    seconds = (run.path / "seconds").read_text()
+    return [name, str(run.config.seeds), *(f"{statistics.median(maes):.3f}" for maes in of_each), seconds]
+
+
+def train(plant: str, name: str, options: Options) -> None:
+    """Run the command, unless its folder is there."""
+    folder = options.runs / f"{plant}-{name}"
+    if folder.exists():
+        return
+    command = ["-m", "jaxouter.train", plant, *VARIANTS[name], "--seeds", str(options.seeds), "--out", str(folder)]
+    print(f"python {' '.join(command)}", flush=True)
+    begun = datetime.now(UTC)
+    subprocess.run([sys.executable, *command], check=True)
+    (folder / "seconds").write_text(f"{(datetime.now(UTC) - begun).total_seconds() / options.seeds:.0f}")
+
+
+def main(options: Options) -> None:
+    """The command."""
+    cli.use_compilation_cache()
+    text = [
+        "# What was tried, and what it gave",
+        "",
+        f"By `python scripts/sweep.py` on {datetime.now(UTC):%Y-%m-%d}, jax {jax.__version__}, Python "
+        f"{platform.python_version()}, 2 CPU cores. Median MAE over the seeds; seconds a seed, of the whole command.",
+    ]
+    for plant in ("pitch", "heaters"):
+        for name in options.only:
+            train(plant, name, options)
+        header = ["change", "seeds", *(identifier.split("/")[1] for identifier in nominal(plant)), "s"]
+        rows = [
+            line(name, Run.open(options.runs / f"{plant}-{name}"))
+            for name in VARIANTS
+            if (options.runs / f"{plant}-{name}").exists()
+        ]
+        table = [header, ["---"] * len(header), *rows]
+        text += ["", f"## {plant}", "", *(f"| {' | '.join(row)} |" for row in table)]
+        commands = [f"- `{name}`: `{' '.join(('jaxouter.train', plant, *VARIANTS[name]))}`" for name, *_ in rows]
+        text += ["", *commands]
+    RESULTS.write_text("\n".join(text) + "\n")
+    print(RESULTS.read_text())
+
+
+if __name__ == "__main__":
+    cli.run(lambda: main(tyro.cli(Options)))
