@@ -126,7 +126,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "training_seconds": sum(row.get("seconds", 0.0) for seed in run.seeds for row in run.rows(seed))
+        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
         / run.config.side_by_side,
         "steps": run.config.steps if run.config.epochs else 0,
         "identification_steps": run.config.identification_episodes * met[0].plant.episode_steps,

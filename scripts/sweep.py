@@ -9,6 +9,7 @@ columns are the scenarios with the plant of the training, the median over the se
 
 from __future__ import annotations
 
+import os
 import platform
 import statistics
 import subprocess
@@ -85,7 +86,8 @@ def main(options: Options) -> None:
         "# What was tried, and what it gave",
         "",
         f"By `python scripts/sweep.py` on {datetime.now(UTC):%Y-%m-%d}, jax {jax.__version__}, Python "
-        f"{platform.python_version()}, 2 CPU cores. Median MAE over the seeds; seconds a seed, of the whole command.",
+        f"{platform.python_version()}, {os.cpu_count()} CPU cores. "
+        "Median MAE over the seeds; seconds a seed, of the whole command.",
     ]
     for plant in ("pitch", "heaters"):
         for name in options.only:

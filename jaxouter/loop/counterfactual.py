@@ -44,7 +44,7 @@ def fit(data: Record, lags: int) -> CounterfactualParams:
 
     Args:
         data: exciting episodes of one plant.
-        lags: n, past samples of y and of r~ on which the next y depends.
+        lags: n, past samples of y and of r~ on which the next y depends; at most half an episode.
     """
     k = np.arange(lags - 1, data.r_tilde.shape[1])
     past = k[:, None] - np.arange(lags)
@@ -61,8 +61,6 @@ def fit(data: Record, lags: int) -> CounterfactualParams:
 def _quiet(y: np.ndarray, disturbance: np.ndarray, a: np.ndarray) -> np.ndarray:
     """`y` (E, T + 1) less what the quick part of the disturbances (E, T - n + 1) of its last samples did to it."""
     window = min(disturbance.shape[1], y.shape[1] // 4) // 2 * 2 + 1
-    if window > disturbance.shape[1]:
-        return y
     quick = disturbance - savgol_filter(disturbance, window, min(2, window - 1))
     did = np.asarray(lfilter([1.0], np.append(1.0, -a), quick))
     return np.concatenate([y[:, : -did.shape[1]], y[:, -did.shape[1] :] - did], 1)

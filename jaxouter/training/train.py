@@ -56,15 +56,18 @@ def train(
         if jax.process_count() == 1 and stop():
             raise _StoppedError
 
+    begun = time.perf_counter()
     try:
         states = {seeds: _begin(run, seeds, done, heard) for seeds in rounds}
     except _StoppedError:
         return None
+    seconds = (time.perf_counter() - begun) / cfg.seeds
     if cfg.pretraining.gradient_steps and not done:
         for seeds in rounds:  # what the start gave is the row of epoch 0
             for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True):
                 if devices.is_first() and not run.rows(seed):
                     row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state)}
+                    row["seconds"] = seconds
                     run.append(seed, row)
                     run.save(seed, 0, state)
                     report(seed, row)

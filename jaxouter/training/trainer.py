@@ -252,6 +252,11 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         ValueError: the configuration does not fit together.
     """
     plant, _ = make_plant(config.check().plant)
+    if config.pretraining.gradient_steps and config.pretraining.lags > plant.episode_steps // 2:
+        raise ValueError(
+            f"pretraining.lags is {config.pretraining.lags}; it must be at most half an episode of {config.plant}, "
+            f"{plant.episode_steps // 2}"
+        )
     total_updates = config.total_updates
     env, params = environment.make(
         config.plant,

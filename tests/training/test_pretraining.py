@@ -85,6 +85,11 @@ def test_the_actor_waits_until_the_critic_has_learned():
     assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (before, state.learner.actor)), strict=True))
 
 
+def test_a_model_longer_than_half_an_episode_is_refused(config):
+    with pytest.raises(ValueError, match=r"pretraining.lags is 26; it must be at most half an episode of lag, 25"):
+        build(replace(config, pretraining=replace(START, lags=26)))
+
+
 @pytest.mark.parametrize(("field", "value"), [("gradient_steps", -1), ("episodes", 0), ("lags", 0), ("batch_size", 0)])
 def test_what_is_not_allowed_is_named(field, value):
     with pytest.raises(ValueError, match=rf"pretraining.{field} is {value}"):
