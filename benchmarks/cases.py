@@ -29,8 +29,9 @@ from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
-from jaxouter.training.config import TrainConfig, preset
+from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 from jaxouter.training.devices import Fleet
+from jaxouter.training.pretraining import CHUNK
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 SGEMM, NORMALS = "sgemm_gflops", "normals_per_s"
@@ -233,7 +234,7 @@ def random_roll_out(plant: str, environments: int) -> Job:
 
 def policy_roll_out(plant: str, environments: int) -> Job:
     trainer, params = build(preset(plant))
-    learned = trainer.policy_params(trainer.start(0, params))
+    learned = trainer.policy_params(trainer.fresh(jax.random.key(0), params))
 
     def act(learned: Any, key: jax.Array, obs: jax.Array, r: jax.Array) -> jax.Array:
         action = trainer.learner.act(learned.actor, obs)[:, 0]
@@ -262,12 +263,11 @@ def update_mflop(config: DDPGConfig, observations: int) -> float:
 def training(
     plant: str, name: str, rows: int | None = None, devices: int = 1
 ) -> tuple[Trainer, EnvParams, TrainConfig]:
-    """The trainer of a preset with a replay of so many rows (None: the preset's own), one seed a device."""
+    """The learner of a preset, not pretrained, with a replay of so many rows (None: its own), one seed a device."""
     base = preset(plant, name)
-    steps = base.steps if rows is None else 2 * rows
-    config = replace(
-        base, replay=rows or base.replay, steps=steps, prefill=FILLED, epoch=FILLED, seeds=devices, devices=devices
-    )
+    rows = rows or base.replay
+    config = replace(base, replay=rows, steps=2 * rows, prefill=FILLED, epoch=FILLED, seeds=devices, devices=devices)
+    config = replace(config, pretraining=PretrainingConfig())
     return *build(config), config
 
 
@@ -356,20 +356,26 @@ def seeds_at_once(seeds: int) -> Job:
 
 
 def first_epoch(config: TrainConfig) -> Callable[[], Any]:
-    """Everything up to the first epoch, both prefill and epoch so short that nearly all of it is compilation."""
-    config = replace(config, prefill=max(config.ddpg.batch_size, 10 * config.environments))
+    """Everything up to the first epoch, or the first `CHUNK` gradient steps of pretraining.
+
+    Prefill and epoch are so short that nearly all of it is compilation.
+    """
+    start = replace(config.pretraining, gradient_steps=min(config.pretraining.gradient_steps, CHUNK))
+    config = replace(config, prefill=max(config.ddpg.batch_size, 10 * config.environments), pretraining=start)
 
     def call() -> None:
         fleet = Fleet.of(config)
         trainer, params = build(config)
-        states = fleet.prefill(fleet.put([trainer.start(0, params)]), params)
-        jax.block_until_ready(fleet.epoch(states, params, 10 * config.environments))
+        states = fleet.put([trainer.start(0, params)])
+        if config.epochs:
+            states = fleet.prefill(states, params)
+            jax.block_until_ready(fleet.epoch(states, params, 10 * config.environments))
 
     return call
 
 
 def compilation(name: str) -> Job:
-    """From nothing to the first epoch of a preset on pitch."""
+    """`first_epoch` of a preset on pitch, from nothing."""
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         from jaxouter import cli  # what the command sets beside the folder; it takes a while to import
 
@@ -378,7 +384,7 @@ def compilation(name: str) -> Job:
 
 
 def memory_of_training(name: str, rows: int | None = None) -> Job:
-    """As `compilation`, with a replay of so many rows (None: the preset's own)."""
+    """Prefill and first epoch of a learner, with a replay of so many rows (None: the preset's own)."""
     return Job(first_epoch(training("pitch", name, rows)[2]), 1, "MiB")
 
 

@@ -33,7 +33,8 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         content = (run.path / "summary.json").read_text()
         (RESULTS / f"{name}.json").write_text(content)
         shutil.copy(run.figures / "paper.png", RESULTS / f"{name}.png")
-        shutil.copy(run.figures / "learning-curve.png", RESULTS / f"{name}-learning.png")
+        if run.config.epochs:
+            shutil.copy(run.figures / "learning-curve.png", RESULTS / f"{name}-learning.png")
         results = json.loads(content)["results"]
         for scenario in scenarios.paper_scenarios(run.config.plant):
             row = rows.setdefault(scenario, {})

@@ -128,8 +128,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
         "median_seed": median,
         "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
         / run.config.side_by_side,
-        "steps": run.config.steps if run.config.epochs else 0,
-        "identification_steps": run.config.identification_episodes * met[0].plant.episode_steps,
+        "steps": run.config.steps,
+        "identification_steps": run.config.environment_steps - run.config.steps,
         "updates": run.config.total_updates,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],

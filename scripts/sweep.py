@@ -1,10 +1,10 @@
 """What was tried on the way to the presets, and what it gave: benchmarks/results/learning.md.
 
     python scripts/sweep.py                             # train what is not there yet, write the table
-    python scripts/sweep.py --seeds 5 --only pretrained
+    python scripts/sweep.py --seeds 5 --only default
 
 Each line of the table is one command of `python -m jaxouter.train`; its run folder is runs/sweep/PLANT-NAME. The
-columns are the scenarios with the plant of the training, the median over the seeds of the MAE.
+columns are the scenarios in which the inner loop alone is stable, the median over the seeds of the MAE.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from pathlib import Path
 import jax
 import tyro
 
-from jaxouter import cli, plants
+from jaxouter import cli
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.evaluate import Named, evaluate
 from jaxouter.training.run import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
-SHORT = ("--steps", "38000", "--ddpg.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
+DDPG_ALONE = ("--pretraining.gradient-steps", "0", "--steps")
+THEN_DDPG = ("--steps", "38000", "--ddpg.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
-    "pretrained": ("--preset", "pretrained"),
-    "pretrained-500": ("--preset", "pretrained", "--pretraining.gradient-steps", "500"),
-    "pretrained-16-episodes": ("--preset", "pretrained", "--pretraining.episodes", "16"),
-    "then-ddpg-3e-5": ("--preset", "pretrained", *SHORT, "--ddpg.actor-rate", "3e-5"),
-    "then-ddpg-3e-6": ("--preset", "pretrained", *SHORT, "--ddpg.actor-rate", "3e-6"),
+    "500-gradient-steps": ("--pretraining.gradient-steps", "500"),
+    "16-episodes": ("--pretraining.episodes", "16"),
+    "undisturbed": ("--pretraining.noise", "0", "--pretraining.load", "0"),
+    "then-ddpg-3e-6": (*THEN_DDPG, "--ddpg.actor-rate", "3e-6"),
+    "ddpg-alone": (*DDPG_ALONE, "128000"),
 }
 
 
@@ -50,16 +51,15 @@ class Options:
     """Where the run folders are."""
 
 
-def nominal(plant: str) -> list[str]:
-    """The paper's own scenarios on the plant of the training, and the families."""
-    first = ["pitch/paper"] if plant == "pitch" else scenarios.paper_scenarios(plant)
-    return first + [f"{plant}/{family}" for family in plants.make(plant)[0].families]
+def met_on(plant: str) -> list[str]:
+    """The scenarios in which the inner loop alone is stable."""
+    return [name for name in scenarios.catalogue(plant) if scenarios.get(name, 1).stable_alone]
 
 
 def line(name: str, run: Run) -> list[str]:
     """Variant, seeds, median MAE of each scenario, and seconds a seed, start included."""
     trainer, _ = run.trainer
-    met = [scenarios.get(identifier) for identifier in nominal(run.config.plant)]
+    met = [scenarios.get(identifier) for identifier in met_on(run.config.plant)]
     policies = [Named("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
     found = [evaluate(policy, met) for policy in policies]
     of_each = [[results[scenario.id][1]["mae"] for results in found] for scenario in met]
@@ -92,7 +92,7 @@ def main(options: Options) -> None:
     for plant in ("pitch", "heaters"):
         for name in options.only:
             train(plant, name, options)
-        header = ["change", "seeds", *(identifier.split("/")[1] for identifier in nominal(plant)), "s"]
+        header = ["change", "seeds", *(identifier.split("/")[1] for identifier in met_on(plant)), "s"]
         rows = [
             line(name, Run.open(options.runs / f"{plant}-{name}"))
             for name in VARIANTS

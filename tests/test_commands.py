@@ -20,6 +20,7 @@ from tests.training.small import small
 
 SMALL = ["--steps", "1600", "--prefill", "640", "--epoch", "480", "--environments", "8", "--replay", "1600"]
 SMALL += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
+SMALL += ["--pretraining.gradient-steps", "0"]
 
 
 def command(module: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -103,7 +104,7 @@ def test_list_names_plants_presets_scenarios_and_policies(capsys):
         assert text in out
 
 
-@pytest.mark.parametrize(("plant", "default"), [("pitch", "128000"), ("heaters", "0.95")])
+@pytest.mark.parametrize(("plant", "default"), [("pitch", "0.99"), ("heaters", "0.95")])
 def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
     with pytest.raises(SystemExit) as end:
         train.main([plant, "--help"])
@@ -116,7 +117,7 @@ def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
     [
         (["submarine"], "no plant 'submarine'; the plants are: pitch, heaters"),
         (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, paper"),
-        (["--steps", "-5"], "steps is -5; it must be positive"),
+        (["--steps", "-5"], "steps is -5; it must be positive, or 0 with pretraining"),
         (["--seeds", "0"], "seeds is 0; it must be positive"),
         (["--replay", "100"], "replay is 100; it must hold at least a batch of 256"),
         (["--no-such-option", "1"], "--no-such-option"),
@@ -218,7 +219,7 @@ def test_third_plant_goes_through_the_whole_of_training(tmp_path, monkeypatch, c
     """Registered by one line, the lag with a delay is learned, and beats the inner loop and the static prefilter."""
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     out = tmp_path / "run"
-    train.main(["lag", "--steps", "16640", "--prefill", "640", "--epoch", "3200", "--out", str(out)])
+    train.main(["lag", "--pretraining.gradient-steps", "200", "--out", str(out)])
     assert to_dict(Run.open(out).config)["plant"] == "lag"
     results = json.loads((out / "summary.json").read_text())["results"]
     maes = {result["policy"]: result["scenarios"]["lag/steps"]["mae"] for result in results}

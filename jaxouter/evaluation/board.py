@@ -36,6 +36,7 @@ from jaxouter.training.run import Run
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
 SET_POINTS = 5  # of the certificate, over the range of evaluation
 LEARNED_NOTE = "The learned outer loop, without exploration."
+TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
 Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
 PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
 
@@ -121,14 +122,15 @@ def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
 
 
 def meet(contender: Contender, plant_name: str, on: str, family_seed: int) -> Tuned:
-    """Figures of merit on a scenario, and the traces of its first episode."""
+    """Figures of merit on a scenario, the traces of its first episode, and the MAE of each (episodes,)."""
     scenario = scenarios.get(on, family_seed=family_seed)
     if contender.kind == "preview":
         best = plan(scenario)
         traces = rollout(Replay(), best.r_tilde, scenario, per_episode=True)
     else:
         traces = rollout(*load(contender, plant_name), scenario)
-    arrays = {name: getattr(traces, name)[:1] for name in ("y0", "r", "y", "r_tilde")}
+    arrays = {name: getattr(traces, name)[:1] for name in TRACES}
+    arrays["mae"] = np.mean(np.abs(traces.r - traces.y), axis=1)
     return Tuned(figures_of_merit(traces, scenario) | {"stable_alone": scenario.stable_alone}, arrays, 0)
 
 
@@ -266,7 +268,7 @@ def policies(contenders: Sequence[Contender], done: Sequence[Done]) -> dict[str,
         if c.kind == "learned":
             paths = dict.fromkeys(other.path or "" for other in contenders if other.kind == "learned")
             configs = {Path(path).name: Run.open(Path(path)).config for path in paths}
-            known |= {"steps": max(config.steps for config in configs.values()), "note": LEARNED_NOTE}
+            known |= {"steps": max(config.environment_steps for config in configs.values()), "note": LEARNED_NOTE}
             known |= {"settings": {name: config.preset for name, config in configs.items()}}
         elif c.kind == "preview":
             known |= {"note": PREVIEW_NOTE}
@@ -281,8 +283,12 @@ def policies(contenders: Sequence[Contender], done: Sequence[Done]) -> dict[str,
 
 
 def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
-    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone."""
+    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone.
+
+    `worse_than_static` is the share of the episodes in which its MAE is above that of `static`.
+    """
     met = [d for d in done if d.job.what == "meet"]
+    static = {d.job.on: d.found.arrays["mae"] for d in met if d.job.contender.name == "static"}
     reference = {(d.job.contender.name, d.job.on): d.found.settings["mae"] for d in met}
 
     def over(mae: float | None, name: str, on: str) -> float | None:
@@ -295,6 +301,7 @@ def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
         stable, outside = figures.pop("stable_alone"), figures["violation_time"]
         mae, alone = figures["mae"], over(figures["mae"], "none", on)
         figures["improvement"] = 100.0 * (1.0 - alone) if alone is not None and stable else None
+        worse = float(np.mean(~(d.found.arrays["mae"] <= static[on]))) if on in static else None
         found.append(
             {
                 "policy": c.name,
@@ -305,6 +312,7 @@ def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
             }
             | {"ratio_to_limit": over(mae, "oracle", on), "ratio_to_bound": over(mae, CLAIRVOYANT, on)}
             | {"within_limits": mae is not None and (outside is None or outside <= WITHIN)}
+            | {"worse_than_static": worse}
             | figures
         )
     return found
@@ -317,7 +325,7 @@ def first_episodes(done: Sequence[Done], on: str) -> dict[Contender, Traces]:
     for d in done:
         if d.job.what == "meet" and d.job.on == on:
             c = d.job.contender
-            found.setdefault(c.line, (c, Traces(**d.found.arrays, **nothing)))
+            found.setdefault(c.line, (c, Traces(**{name: d.found.arrays[name] for name in TRACES}, **nothing)))
     return dict(found.values())
 
 

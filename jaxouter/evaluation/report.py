@@ -92,6 +92,7 @@ def merits(y_unit: str, time_unit: str) -> list[Merit]:
         Merit("ratio_to_limit", "ratio to the limit", "", "MAE over that of the limit"),
         Merit("ratio_to_bound", "ratio to the bound", "", "MAE over that of the policy with preview, a lower bound"),
         Merit("improvement", "improvement", "%", "of the MAE over the inner loop alone; not where that is unstable"),
+        Merit("worse_than_static", "worse than static", "share", "share of the episodes whose MAE is above static's"),
         Merit("iae", "IAE", f"{y} {t}", "integral of e over an episode"),
         Merit("ise", "ISE", f"{y}² {t}", "integral of e²"),
         Merit("itae", "ITAE", f"{y} {t}²", "integral of t e over a set-point, t from its start"),

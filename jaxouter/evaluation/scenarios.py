@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxouter.loop import sensor as sensors
 from jaxouter.loop.references import FAMILIES
 from jaxouter.loop.sensor import SensorParams
-from jaxouter.plants import Plant, make
+from jaxouter.plants import Plant, Ranges, make
 from jaxouter.plants.pitch import W_PRINTED
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
 NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
+Place = Literal["inside", "edge", "outside"]
+OF_THE_START = ("x0_mean", "x0_spread", "weights")
+ROUNDING = 1e-5
 PITCH_SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
 PITCH_MAX_DELAY = (
     5.7  # s; one length of the delay lines for all scenarios with delays of u, which so share a compilation
@@ -180,6 +184,38 @@ def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_
         ValueError: there is no such plant or scenario; lists those that exist.
     """
     return builder(identifier, family_seed)(episodes)
+
+
+def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
+    """Where a scenario lies among the plants of a training under domain randomisation.
+
+    Args:
+        scenario: whose plant, whatever its references.
+        ranges: numbers of the plant that training drew; the others were the nominal ones.
+        noise: largest standard deviation of the measurement noise in training.
+
+    Returns:
+        'outside' where any number is outside of what training drew, else 'edge' where one that is drawn has its least
+        or greatest value, else 'inside'. How many houses there are and where they start counts for nothing.
+    """
+    drawn = {name: (low, high) for name, low, high in ranges}
+    bounds: dict[str, Any] = {name: (leaf, leaf) for name, leaf in _numbers(make(scenario.plant.name)[1]).items()}
+    bounds |= drawn | {"noise": (0.0, noise)}
+    found = [("noise", np.asarray(scenario.sensor.noise)), *_numbers(scenario.params).items()]
+    found += [] if scenario.change is None else list(_numbers(scenario.change[1]).items())
+    edge = False
+    for name, leaf in found:
+        low, high = (np.asarray(end) for end in bounds[name])
+        if np.any(leaf < low - ROUNDING) or np.any(leaf > high + ROUNDING):
+            return "outside"
+        edge |= name in drawn and bool(np.any((leaf < low + ROUNDING) | (leaf > high - ROUNDING)))
+    return "edge" if edge else "inside"
+
+
+def _numbers(params: Any) -> dict[str, np.ndarray]:
+    """Leaves by their names, but for those of the start."""
+    leaves = {path[-1].name: np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
+    return {name: leaf for name, leaf in leaves.items() if name not in OF_THE_START}
 
 
 def paper_scenarios(name: str) -> list[str]:

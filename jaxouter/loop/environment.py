@@ -24,7 +24,7 @@ from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
 from jaxouter.loop.rewards import RewardParams
 from jaxouter.loop.sensor import SensorParams
-from jaxouter.plants import Plant
+from jaxouter.plants import Plant, Ranges, randomised
 from jaxouter.plants import make as make_plant
 
 RESET = 1  # folded into the key of a step that ends an episode
@@ -166,6 +166,7 @@ def make(
     history: int | None = None,
     integral_steps: float | None = None,
     goal: Goal | None = None,
+    drawn: Ranges = (),
     **overrides: Any,
 ) -> tuple[Environment, EnvParams]:
     """An environment on the training distribution, and its parameters.
@@ -174,9 +175,12 @@ def make(
         name: plant, see `jaxouter.plants.make`.
         history, integral_steps: of the observation, see `Observer.of`.
         goal: reference generator; None: one set-point an episode, as in the paper.
+        drawn: numbers of the plant that are drawn at each reset, see `jaxouter.plants.randomised`.
         **overrides: parameters of the plant.
     """
     plant, plant_params = make_plant(name, **overrides)
+    if drawn:
+        plant, plant_params = randomised(plant, plant_params, drawn)
     goal = SetPoint(*plant.setpoint_range) if goal is None else goal
     env = Environment(plant, Observer.of(plant, history, integral_steps), goal)
     return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant))

@@ -35,22 +35,40 @@ def telegraph(key: chex.PRNGKey, steps: int, low: float, high: float, redraw: ja
     return levels[jax.lax.cummax(jnp.where(when, jnp.arange(steps), 0))]
 
 
+def wander(key: chex.PRNGKey, steps: int, low: float, high: float, inertia: jax.Array | float) -> jax.Array:
+    """A smooth random course, (steps,), at each time uniform in [low, high].
+
+    Gaussian noise behind two lags of time constant `inertia` (control steps), by its spectrum, squashed to the range.
+    """
+    k = jnp.arange(steps // 2 + 1, dtype=float)
+    pole = jnp.exp(-1.0 / inertia)
+    gain = 1.0 / (1.0 - 2.0 * pole * jnp.cos(2.0 * jnp.pi * k / steps) + pole**2)  # of two equal lags
+    real, imaginary = gain[None] * jax.random.normal(key, (2, k.size), float)
+    course = jnp.fft.irfft(jax.lax.complex(real, imaginary), steps) * steps
+    variance = jnp.sum(gain**2 * jnp.where((k == 0.0) | (2.0 * k == steps), 1.0, 4.0))
+    return low + (high - low) * jax.scipy.special.ndtr(course / jnp.sqrt(variance))
+
+
 def redrawn(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
     """Reference of a training episode, (steps,): set-points in [low, high], redrawn at random times.
 
-    A third of the episodes keep one set-point. In a third it is redrawn, with a probability that is log-uniform from
-    one to twenty times an episode. In a third it is redrawn at each step near the one before: a random walk, reflected
-    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range.
+    A fifth of the episodes keep one set-point. In a fifth it is redrawn, with a probability that is log-uniform from
+    one to twenty times an episode. In a fifth it is redrawn at each step near the one before: a random walk, reflected
+    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range. In the
+    rest it wanders smoothly over a part of the range, with a time constant log-uniform from a fiftieth to a fifth of an
+    episode.
     """
-    key_kind, key_rate, key_run = jax.random.split(key, 3)
-    share = jax.random.uniform(key_rate, (), float)
+    key_kind, key_share, key_part, key_run = jax.random.split(key, 4)
+    share, width, place = jax.random.uniform(key_share, (3,), float)
     rate = 20.0**share / steps
     first = telegraph(key_run, steps, low, high, 0.0)
     moves = 0.0025 * 20.0**share * jax.random.normal(key_run, (steps,), float)
     walk = (first[0] - low) / (high - low) + jnp.cumsum(moves)
     reflected = low + (high - low) * jnp.abs((walk + 1.0) % 2.0 - 1.0)
-    kind = jax.random.randint(key_kind, (), 0, 3)
-    return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected])[kind]
+    part = (0.1 + 0.9 * width) * wander(key_part, steps, 0.0, 1.0, 0.02 * 10.0**share * steps)
+    wandering = low + (high - low) * (part + 0.9 * (1.0 - width) * place)
+    kind = jnp.minimum(jax.random.randint(key_kind, (), 0, 5), 3)
+    return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected, wandering])[kind]
 
 
 def staircase(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,10 @@ import jax
 from jaxouter.plants import heaters, pitch
 from jaxouter.plants.base import Plant
 
-__all__ = ["REGISTRY", "Plant", "make", "resolve", "simulate"]
+__all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate"]
+
+Ranges = tuple[tuple[str, float, float], ...]
+"""Names of a plant's numbers, and between what each is drawn."""
 
 REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
 
@@ -47,6 +51,45 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
     if unknown:
         raise ValueError(f"plant {name!r} has no parameter {', '.join(unknown)}; it has: {', '.join(known)}")
     return maker(**overrides)
+
+
+def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
+    """The plant with some of its numbers drawn anew for each episode, uniformly (domain randomisation).
+
+    For example: `plant, params = randomised(*make("pitch"), (("gain", 0.8, 1.2), ("d1", 0.0, 0.7)))`.
+
+    Args:
+        plant, params: as `make` returns them.
+        ranges: fields of the parameters that are numbers, each with its least and greatest value.
+
+    Returns:
+        The plant, which now has a `draw`, and parameters in which what is not drawn is as it was.
+
+    Raises:
+        ValueError: a name is not one of the plant's numbers (lists those), or a range is none.
+    """
+    named = {name: (low, high) for name, low, high in ranges}
+    names = [
+        getattr(path[-1], "name", "") if jax.numpy.ndim(leaf) == 0 else ""
+        for path, leaf in jax.tree_util.tree_leaves_with_path(params)
+    ]
+    for name, (low, high) in named.items():
+        if name not in names:
+            known = ", ".join(sorted(filter(None, names)))
+            raise ValueError(f"plant {plant.name!r} has no number {name!r} to draw; it has: {known}")
+        if not low <= high:
+            raise ValueError(f"the range of {name} is {low:g} to {high:g}; the first must not be above the second")
+
+    def draw(key: chex.PRNGKey, params: Any) -> Any:
+        leaves, structure = jax.tree.flatten(params)
+        shares = dict(zip(named, jax.random.uniform(key, (len(named),), float), strict=True))
+        drawn = [
+            leaf if name not in named else named[name][0] + (named[name][1] - named[name][0]) * shares[name]
+            for name, leaf in zip(names, leaves, strict=True)
+        ]
+        return jax.tree.unflatten(structure, drawn)
+
+    return replace(plant, draw=draw), plant.widened(params, named)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +91,8 @@ class Plant:
     """`noise_free(params) -> params`: the same plant without noise."""
     smallest: Callable[[Any], Any] = lambda params: params
     """`smallest(params) -> params`: the same plant, of given (not traced) numbers, with no more state than it needs."""
+    widened: Callable[[Any, Mapping[str, tuple[float, float]]], Any] = lambda params, ranges: params
+    """`widened(params, ranges) -> params`: the same plant, so made that its numbers may lie in these ranges."""
 
     def __post_init__(self) -> None:
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import chex
@@ -185,6 +185,22 @@ def smallest(params: PitchParams) -> PitchParams:
     """The same plant with the shortest delay lines that serve it, in whole control steps if it can be."""
     delays = dict(tau=float(params.tau), d1=float(params.d1), d2=float(params.d2))
     return dataclasses.replace(params, max_delay=_enough(*delays.values()), late=_late(params.substeps, **delays))
+
+
+def widened(params: PitchParams, ranges: Mapping[str, tuple[float, float]]) -> PitchParams:
+    """The same plant with delay lines for delays in these ranges, then inner step by inner step.
+
+    Raises:
+        ValueError: a delay may be negative.
+    """
+    delays = {name: ranges[name] for name in ("tau", "d1", "d2") if name in ranges}
+    for name, (low, high) in delays.items():
+        if not low >= 0.0:
+            raise ValueError(f"the range of {name} is {low:g} to {high:g} s; a delay must not be negative")
+    if not delays:
+        return params
+    longest = _enough(params.max_delay, *(high for _, high in delays.values()))
+    return dataclasses.replace(params, max_delay=longest, late=None)
 
 
 def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
@@ -370,6 +386,7 @@ PITCH = Plant(
     variables=variables,
     settled=settled,
     smallest=smallest,
+    widened=widened,
     y_unit="crad",
     time_unit="s",
     control_step=CONTROL_STEP,

@@ -21,17 +21,26 @@ class PretrainingConfig:
     """Gradient steps of the actor on the identified model; 0: no such start."""
     episodes: int = 64
     """Episodes of the plant that are recorded under random r~, besides --steps."""
-    lags: int = 15
-    """Past samples of r~ and y in the model."""
+    plants: int = 1
+    """Plants of which they are, each drawn from --randomise; more than one needs it."""
+    lags: int | None = None
+    """Past samples of r~ and y in the model; None: as many as the observation holds."""
     batch_size: int = 64
     """Episodes of the model a gradient step."""
+    noise: float = 0.0
+    """Largest standard deviation of the measurement noise that half of these have; 1 is half the set-point range."""
+    load: float = 0.0
+    """Largest unseen step of r~, at a random time, that half of these have; 1 is half the range of r~."""
 
     def check(self) -> None:
         """Raises ValueError, naming field, value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
-        for name in ("episodes", "lags", "batch_size"):
-            if getattr(self, name) < 1:
+        for name in ("noise", "load"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must not be negative")
+        for name in ("episodes", "plants", "lags", "batch_size"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must be at least 1")
 
 
@@ -51,7 +60,7 @@ class TrainConfig:
     """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
     spans several, which share its environments, replay and batch, and then draw otherwise than one."""
     steps: int = 200_000
-    """Environment steps in all, over all environments, prefill included; equal to it, the pretrained actor stays."""
+    """Environment steps of the learner, over all environments, prefill included; 0: the pretrained actor stays."""
     environments: int = 1
     """Environments that roll out in parallel."""
     updates: int = 1
@@ -68,6 +77,8 @@ class TrainConfig:
     """Time constant of the leaky integral, in control steps; None: a quarter of an episode."""
     redraw: float = 0.0
     """Probability at each control step that the set-point is redrawn within an episode."""
+    randomise: plants.Ranges = ()
+    """Numbers of the plant that are drawn anew for each episode: name, least, greatest (and again)."""
     residual: bool = False
     """Learn a correction of the static prefilter, identified first, instead of r~ itself."""
     reward_scale: float = 1.0
@@ -92,9 +103,18 @@ class TrainConfig:
         plants.resolve(self.plant)
         self.pretraining.check()
         self.ddpg.check()
-        for name in ("seeds", "devices", "steps", "environments", "updates", "epoch", "reward_scale"):
+        if (self.pretraining.plants > 1) and not self.randomise:
+            raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
+        if self.pretraining.episodes % self.pretraining.plants:
+            raise ValueError(
+                f"pretraining.episodes is {self.pretraining.episodes}; it must be a multiple of the "
+                f"{self.pretraining.plants} plants"
+            )
+        for name in ("seeds", "devices", "environments", "updates", "epoch", "reward_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
+        if self.steps < 0 or not (self.steps or self.pretraining.gradient_steps):
+            raise ValueError(f"steps is {self.steps}; it must be positive, or 0 with pretraining")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; it must not be negative")
         for name in ("steps", "epoch", "prefill"):
@@ -112,11 +132,10 @@ class TrainConfig:
                     f"{name} is {value}; it must be a multiple of the {self.shards} devices that each of the "
                     f"{self.seeds} seeds gets of {self.devices}"
                 )
-        most = self.steps - (0 if self.pretraining.gradient_steps else 1)  # what is pretrained may stay as it is
-        if not self.ddpg.batch_size <= self.prefill <= most:
+        if self.prefill < self.ddpg.batch_size or 0 < self.steps <= self.prefill:
+            most = f" and less than the {self.steps} steps" if self.steps else ""
             raise ValueError(
-                f"prefill is {self.prefill}; it must lie between the batch size, {self.ddpg.batch_size}, "
-                f"and the {self.steps} steps"
+                f"prefill is {self.prefill}; it must be at least the batch size, {self.ddpg.batch_size}{most}"
             )
         if self.prefill <= self.ddpg.n_step * self.environments:
             raise ValueError(
@@ -148,7 +167,7 @@ class TrainConfig:
     @property
     def epochs(self) -> int:
         """Epochs after the prefill; the last one may be shorter."""
-        return -(-(self.steps - self.prefill) // self.epoch)
+        return max(0, -(-(self.steps - self.prefill) // self.epoch))
 
     @property
     def identification_episodes(self) -> int:
@@ -157,16 +176,21 @@ class TrainConfig:
         return recorded + (LEVELS if self.residual else 0)
 
     @property
+    def environment_steps(self) -> int:
+        """Control steps of the plant that one seed sees, identification included."""
+        return self.steps + self.identification_episodes * plants.make(self.plant)[0].episode_steps
+
+    @property
     def total_updates(self) -> int:
         """Gradient updates of one seed."""
-        return (self.steps - self.prefill) // self.environments * self.updates
+        return max(0, self.steps - self.prefill) // self.environments * self.updates
 
 
 PAPER = TrainConfig(plant="pitch", preset="paper", prefill=200)
 DEFAULT = TrainConfig(
     plant="pitch",
     preset="default",
-    steps=128_000,
+    steps=0,
     environments=16,
     updates=4,
     prefill=8_000,
@@ -177,6 +201,7 @@ DEFAULT = TrainConfig(
     noise_theta=0.15,
     noise_sigma=(0.0125, 0.1),
     integral_steps=20.0,
+    pretraining=PretrainingConfig(gradient_steps=1_500, noise=0.015, load=0.1),
     ddpg=DDPGConfig(
         hidden=(128, 128),
         layer_norm=True,
@@ -190,33 +215,18 @@ DEFAULT = TrainConfig(
         saturation_penalty=1e-3,
     ),
 )
-PRETRAINED = replace(
-    DEFAULT,
-    preset="pretrained",
-    steps=8_000,
-    prefill=8_000,
-    pretraining=PretrainingConfig(gradient_steps=1_000),
-)
 PRESETS: dict[str, dict[str, TrainConfig]] = {
-    "pitch": {"default": DEFAULT, "paper": PAPER, "pretrained": PRETRAINED},
+    "pitch": {"default": DEFAULT, "paper": PAPER},
     "heaters": {
         "default": replace(
             DEFAULT,
             plant="heaters",
-            steps=68_000,
             integral_steps=None,
             reward_scale=1.0,
+            pretraining=replace(DEFAULT.pretraining, noise=0.02, load=0.2),
             ddpg=replace(DEFAULT.ddpg, discount=0.95),
         ),
         "paper": replace(PAPER, plant="heaters", steps=400_000),
-        "pretrained": replace(
-            PRETRAINED,
-            plant="heaters",
-            integral_steps=None,
-            reward_scale=1.0,
-            pretraining=replace(PRETRAINED.pretraining, lags=5),
-            ddpg=replace(DEFAULT.ddpg, discount=0.95),
-        ),
     },
 }
 
@@ -246,15 +256,20 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
         ValueError: a field is missing or unknown, or a value is not allowed.
     """
 
+    def frozen(value: Any) -> Any:
+        return tuple(map(frozen, value)) if isinstance(value, list) else value
+
     def build(cls: type, values: dict[str, Any]) -> Any:
         names = {f.name for f in dataclasses.fields(cls)}
         if set(values) != names:
             raise ValueError(f"the configuration has fields {sorted(set(values) ^ names)} missing or unknown")
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+        return cls(**{name: frozen(value) for name, value in values.items()})
 
-    # Runs of versions that knew one device only, and no pretraining, go on as they were.
+    # Runs of versions that knew one device only, no pretraining and no randomisation, go on as they were.
     nested = {
-        "pretraining": build(PretrainingConfig, values.get("pretraining", dataclasses.asdict(PretrainingConfig()))),
+        "pretraining": build(
+            PretrainingConfig, dataclasses.asdict(PretrainingConfig()) | values.get("pretraining", {})
+        ),
         "ddpg": build(DDPGConfig, {"actor_from": 0, **values.get("ddpg", {})}),
     }
-    return build(TrainConfig, {"devices": 1, **values, **nested})
+    return build(TrainConfig, {"devices": 1, "randomise": (), **values, **nested})

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from jaxouter.loop import counterfactual, identify, rewards
@@ -26,8 +27,10 @@ from jaxouter.plants import Plant
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
-RATE, CLIP = 3e-3, 1.0  # learning rate at first; bound of the gradient's norm
+RATE = 3e-3  # learning rate at first
+CLIP = 0.1  # of the gradient's norm; below what is usual, so that a batch in which the loop was unstable counts no more
 CHUNK = 50  # gradient steps between two reports
+LAST, COLLAPSED = 5, 2.0  # where these steps' mean reward is so many times the best one, the loop has become unstable
 FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 
 
@@ -46,31 +49,50 @@ class Teacher:
     policy: LearnedPolicy
     batch: int = 64
     """Episodes a gradient step (and seed)."""
+    noise: float = 0.0
+    """Largest standard deviation of the measurement noise, in half of the episodes; 1 is half the set-point range."""
+    load: float = 0.0
+    """Largest unseen step of r~, at a random time in half of the episodes; 1 is half the range of r~."""
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward a step, and the policy's carries (T, ...) with r and y (T,)."""
         plant, steps = self.plant, self.plant.episode_steps
-        key_draw, key_start, key_r, key_run, key_quiet = jax.random.split(key, 5)
+        key_draw, key_start, key_r, key_run, key_quiet, key_noise, key_load = jax.random.split(key, 7)
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
         quiet = jax.random.bernoulli(key_quiet)
         plant_params = jax.tree.map(partial(jnp.where, quiet), plant.noise_free(plant_params), plant_params)
         price = rewards.params(plant)
         r = redrawn(key_r, steps, *plant.setpoint_range)
+        load, noise = self._load(key_load, steps), self._noise(key_noise, steps)
         state = plant.training_start(key_start, plant_params)
         y = plant.output(plant_params, state)
 
         def step(loop: Any, x: Any) -> Any:
             state, carry, y, before = loop
-            r_k, key = x
-            after, r_tilde = policy.act(policy_params, carry, r_k, y)
-            state = plant.step(plant_params, state, r_tilde, key)
+            r_k, noise_k, load_k, key = x
+            y_seen = y + noise_k
+            after, r_tilde = policy.act(policy_params, carry, r_k, y_seen)
+            state = plant.step(plant_params, state, r_tilde + load_k, key)
             y_next = plant.output(plant_params, state)
             reward = rewards.reward(price, r_k, y_next, y, r_tilde, before)
-            return (state, after, y_next, r_tilde), (reward, carry, r_k, y)
+            return (state, after, y_next, r_tilde), (reward, carry, r_k, y_seen)
 
-        begin = (state, policy.init(policy_params, r[0], y), y, jnp.clip(y, *plant.r_tilde_bounds))
-        _, (reward, *seen) = jax.lax.scan(step, begin, (r, jax.random.split(key_run, steps)))
+        begin = (state, policy.init(policy_params, r[0], y + noise[0]), y, jnp.clip(y, *plant.r_tilde_bounds))
+        _, (reward, *seen) = jax.lax.scan(step, begin, (r, noise, load, jax.random.split(key_run, steps)))
         return jnp.mean(reward), seen
+
+    def _noise(self, key: chex.PRNGKey, steps: int) -> jax.Array:
+        """Measurement noise (steps,)."""
+        key_level, key_run = jax.random.split(key)
+        level = jnp.maximum(0.0, jax.random.uniform(key_level, (), float, -1.0, 1.0))
+        return self.noise * self.policy.observer.y_scale * level * jax.random.normal(key_run, (steps,), float)
+
+    def _load(self, key: chex.PRNGKey, steps: int) -> jax.Array:
+        """What is added to r~ (steps,): nothing, from a random time on a constant."""
+        low, high = self.plant.r_tilde_bounds
+        since, size = jax.random.uniform(key, (2,), float, -1.0, 1.0)
+        step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
+        return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
 
     @partial(jax.jit, static_argnums=0)
     def whitening(self, prior: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
@@ -88,7 +110,7 @@ class Teacher:
     @partial(jax.jit, static_argnums=0)
     def train(
         self, carry: Any, white: Whitening, prior: AffineParams, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
-    ) -> Any:
+    ) -> tuple[Any, jax.Array]:
         """Gradient steps with the given rates (n,), on fresh episodes each.
 
         Args:
@@ -96,6 +118,9 @@ class Teacher:
             white, prior, plant_params: the same for all seeds.
             rates: learning rates.
             key: episodes, the same for all seeds.
+
+        Returns:
+            carry, and the mean reward that each step began with (n, seeds).
         """
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
@@ -103,16 +128,17 @@ class Teacher:
             return -jnp.mean(jax.vmap(lambda key: self.episode(self.policy, params, plant_params, key)[0])(keys))
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
+            cost, gradient = jax.value_and_grad(loss)(actor, keys)
             with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
-                step, state = ADAM.update(jax.grad(loss)(actor, keys), state)
-            return jax.tree.map(lambda p, s: p - rate * s, actor, step), state
+                step, state = ADAM.update(gradient, state)
+            return (jax.tree.map(lambda p, s: p - rate * s, actor, step), state), -cost
 
-        def step(carry: Any, x: Any) -> tuple[Any, None]:
+        def step(carry: Any, x: Any) -> tuple[Any, jax.Array]:
             rate, key = x
             keys = jax.random.split(key, self.batch)
-            return jax.vmap(update, (0, 0, None, None))(carry[0], carry[1], rate, keys), None
+            return jax.vmap(update, (0, 0, None, None))(carry[0], carry[1], rate, keys)
 
-        return jax.lax.scan(step, carry, (rates, jax.random.split(key, len(rates))))[0]
+        return jax.lax.scan(step, carry, (rates, jax.random.split(key, len(rates))))
 
 
 ADAM = optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam())
@@ -143,6 +169,9 @@ def pretrain(
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
+    Gradients through a loop that has become unstable lead nowhere. Where that happened, training goes on, with other
+    episodes, from where it was two reports before.
+
     Args:
         config: how many of both.
         plant, plant_params: only recorded from, through r~ and y.
@@ -152,15 +181,27 @@ def pretrain(
         report: called with the gradient steps done (progress).
     """
     key_record, key_white, key_actor, key_run = jax.random.split(key, 4)
-    model = counterfactual.fit(identify.record(plant, plant_params, key_record, config.episodes), config.lags)
-    school = Teacher(counterfactual.plant(plant, config.lags), policy, config.batch_size)
+    lags = config.lags or policy.observer.history
+    models = []
+    for key_plant in jax.random.split(key_record, config.plants):
+        one = plant_params if plant.draw is None else plant.draw(jax.random.fold_in(key_plant, 1), plant_params)
+        data = identify.record(plant, one, key_plant, config.episodes // config.plants)
+        models.append(counterfactual.fit(data, lags))
+    model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
+    school = Teacher(counterfactual.plant(plant, lags), policy, config.batch_size, config.noise, config.load)
     white = school.whitening(prior, model, key_white)
     actors = jax.tree.map(lambda leaf: leaf[None], policy.learner.init(key_actor).actor)
     carry = actors, jax.vmap(ADAM.init)(actors)
-    rates = cosine(config.gradient_steps)
+    rates, best, trail = cosine(config.gradient_steps), -np.inf, [carry]
     for begin in range(0, config.gradient_steps, CHUNK):
         chunk = rates[begin : begin + CHUNK]
-        carry = school.train(carry, white, prior, model, chunk, jax.random.fold_in(key_run, begin))
-        jax.block_until_ready(carry)
+        carry, reward = school.train(carry, white, prior, model, chunk, jax.random.fold_in(key_run, begin))
+        reward = np.asarray(reward)[:, 0]
+        best, reached = max(best, reward[0]), reward[-LAST:].mean()
+        if reached > COLLAPSED * best:  # both negative
+            best, trail = max(best, reached), [*trail[-1:], carry]
+        else:
+            carry = trail[0]
+            trail = [carry]
         report(begin + len(chunk))
     return folded(jax.tree.map(lambda leaf: leaf[0], carry[0]), white)

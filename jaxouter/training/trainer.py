@@ -252,19 +252,23 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         ValueError: the configuration does not fit together.
     """
     plant, _ = make_plant(config.check().plant)
-    if config.pretraining.gradient_steps and config.pretraining.lags > plant.episode_steps // 2:
-        raise ValueError(
-            f"pretraining.lags is {config.pretraining.lags}; it must be at most half an episode of {config.plant}, "
-            f"{plant.episode_steps // 2}"
-        )
     total_updates = config.total_updates
     env, params = environment.make(
         config.plant,
         history=config.history,
         integral_steps=config.integral_steps,
         goal=SetPoint(*plant.setpoint_range, config.redraw),
+        drawn=config.randomise,
     )
-    per_environment = min(config.replay, config.steps) // config.environments  # it never holds more than there is
+    lags = config.pretraining.lags or env.observer.history
+    if config.pretraining.gradient_steps and lags > plant.episode_steps // 2:
+        raise ValueError(
+            f"pretraining.lags is {lags}; it must be at most half an episode of {config.plant}, "
+            f"{plant.episode_steps // 2}"
+        )
+    # The replay never holds more than there is, and little where nothing is learned from it.
+    least = 2 * (env.observer.history + config.ddpg.n_step)
+    per_environment = max(least, min(config.replay, config.steps) // config.environments)
     config = replace(
         config,
         environments=config.environments // shards,

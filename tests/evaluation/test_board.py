@@ -138,7 +138,9 @@ def run(tmp_path_factory):
 def met(contender: Contender, on: str, mae: float | None, outside: float | None = 0.0, stable: bool = True) -> Done:
     figures = {"mae": mae, "improvement": None, "violation_time": outside, "return": -1.0}
     diverged = {"diverged": True} if mae is None else {}
-    return Done(Job("meet", contender, "pitch", on), Tuned(figures | diverged | {"stable_alone": stable}, {}, 0), 0.5)
+    arrays = {"mae": np.array([mae, mae], float)}
+    settings = figures | diverged | {"stable_alone": stable}
+    return Done(Job("meet", contender, "pitch", on), Tuned(settings, arrays, 0), 0.5)
 
 
 def by_policy(done: list[Done]) -> dict[str, dict]:
@@ -184,6 +186,15 @@ def test_improvement_means_nothing_where_the_inner_loop_is_unstable_but_ratios_d
     done = [met(c, "pitch/delay-5.7", mae, stable=False) for c, mae in ((NONE, 27.0), (STATIC, 9.0), (ORACLE, 3.0))]
     row = by_policy(done)["static"]
     assert (row["improvement"], row["ratio_to_limit"]) == (None, 3.0)
+
+
+def test_episodes_in_which_static_is_better_are_counted():
+    done = [met(c, "pitch/paper", mae) for c, mae in ((USER, 1.0), (STATIC, 2.0), (NONE, 3.0), (ORACLE, None))]
+    done[0].found.arrays["mae"][1] = 2.5
+    assert {name: row["worse_than_static"] for name, row in by_policy(done).items()} == {
+        USER.name: 0.5, "static": 0.0, "none": 1.0, "oracle": 1.0
+    }  # fmt: skip
+    assert by_policy(done[2:3])["none"]["worse_than_static"] is None
 
 
 def test_rows_of_what_diverged():
@@ -340,9 +351,10 @@ def test_meet_is_the_evaluation_of_the_policy(run):
     ):
         found, traces = board.meet(contender, "lag", "lag/ramps", 3), rollout(*policy, scenario)
         assert found.settings == figures_of_merit(traces, scenario) | {"stable_alone": True}
-        assert found.arrays.keys() == {"y0", "r", "y", "r_tilde"}
-        for name, array in found.arrays.items():
-            np.testing.assert_array_equal(array, getattr(traces, name)[:1])
+        assert found.arrays.keys() == {"y0", "r", "y", "r_tilde", "mae"}
+        assert found.arrays["mae"].mean() == pytest.approx(found.settings["mae"], rel=1e-5)
+        for name in board.TRACES:
+            np.testing.assert_array_equal(found.arrays[name], getattr(traces, name)[:1])
     assert board.meet(NONE, "lag", "lag/ramps", 4).settings["mae"] != found.settings["mae"]
 
 

@@ -37,7 +37,11 @@ def row(name: str, identifier: str, figures: dict, limit: float) -> dict:
     ratio = figures["mae"] / limit
     within = figures["violation_time"] <= 0.001
     place = {"policy": name, "run": None, "seed": None, "scenario": identifier, "rank": None, "best": False}
-    return place | figures | {"ratio_to_limit": ratio, "ratio_to_bound": None, "within_limits": within}
+    return (
+        place
+        | figures
+        | {"ratio_to_limit": ratio, "ratio_to_bound": None, "worse_than_static": None, "within_limits": within}
+    )
 
 
 def swept(named: Named, axes: dict[str, list[float]]) -> dict:

@@ -95,3 +95,32 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
 def test_unknown_scenario_lists_those_that_exist():
     with pytest.raises(ValueError, match="no scenario 'pitch/papers'; pitch has: pitch/paper, "):
         scenarios.get("pitch/papers")
+
+
+PITCH_RANGES = (("tau", 0.3, 0.7), ("d1", 0.0, 0.57), ("d2", 0.0, 6.0))
+HEATERS_RANGES = (("Pi", 0.3, 2.0), ("x_out", -15.0, 0.0), ("Ca", 7.0, 13.0), ("Ua", 0.14, 0.26))
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges", "noise", "place"),
+    [
+        ("pitch/paper", (), 0.0, "inside"),
+        ("pitch/sines", PITCH_RANGES, 0.0, "edge"),  # d1 = d2 = 0
+        ("pitch/delay-0.57", PITCH_RANGES, 0.0, "edge"),
+        ("pitch/delay-swapped", (("d1", 0.0, 1.0), ("d2", 0.0, 6.0)), 0.0, "inside"),
+        ("pitch/delay-5.7", PITCH_RANGES, 0.0, "outside"),
+        ("pitch/uncertainty", PITCH_RANGES, 0.0, "outside"),
+        ("pitch/load", (("disturbance", -3.0, 3.0),), 0.0, "inside"),
+        ("pitch/load", (("disturbance", -3.0, 1.0),), 0.0, "outside"),
+        ("pitch/noise", (), 0.1, "outside"),
+        ("pitch/noise", (), 0.3, "inside"),
+        ("heaters/paper-1000", HEATERS_RANGES, 0.0, "inside"),
+        ("heaters/riccati", HEATERS_RANGES, 0.0, "outside"),
+        ("heaters/cold", HEATERS_RANGES, 0.0, "edge"),
+        ("heaters/load", HEATERS_RANGES, 0.0, "edge"),
+        ("heaters/mixed-stock", HEATERS_RANGES, 0.0, "inside"),
+        ("heaters/mixed-stock", (("Ca", 8.0, 12.0), ("Ua", 0.14, 0.26)), 0.0, "outside"),
+    ],
+)
+def test_place_of_a_scenario_among_the_plants_of_a_training(name, ranges, noise, place):
+    assert scenarios.place(scenarios.get(name), ranges, noise) == place

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, telegraph
+from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, redrawn, telegraph, wander
 
 KEY = jax.random.key(0)
 STEPS = 200
@@ -206,3 +206,35 @@ def test_family_goal_plays_its_trajectory_and_holds_the_end(kind: str) -> None:
 @pytest.mark.parametrize("goal", [SetPoint(0.0, 1.0), Reaimed(0.0, 1.0, 0.1), Family("days", 24, 0.0, 1.0)])
 def test_goals_are_static(goal: Goal) -> None:
     assert hash(goal) == hash(type(goal)(*vars(goal).values()))
+
+
+def wandering(inertia: float) -> np.ndarray:
+    """(MEMBERS, STEPS)."""
+    draw = jax.jit(jax.vmap(lambda key: wander(key, STEPS, LOW, HIGH, inertia)))
+    return np.asarray(draw(jax.random.split(KEY, MEMBERS)))
+
+
+def test_a_course_wanders_over_all_of_the_range_alike() -> None:
+    r = wandering(2.0)
+    assert r.min() >= LOW
+    assert r.max() <= HIGH
+    shares = np.histogram(r, bins=8, range=(LOW, HIGH))[0] / r.size
+    np.testing.assert_allclose(shares, 1 / 8, atol=0.02)
+
+
+def test_with_more_inertia_a_course_is_smoother() -> None:
+    """Behind two lags the speed is finite: it falls as 1 / inertia."""
+    slow, fast = wandering(20.0), wandering(5.0)
+    speeds, changes = ([np.abs(np.diff(r, n)).mean() for r in (slow, fast)] for n in (1, 2))
+    assert speeds[0] == pytest.approx(speeds[1] / 4, rel=0.3)
+    assert changes[0] < 0.6 * speeds[0]  # white noise: 1.7
+
+
+def test_training_references_are_of_four_kinds_in_the_range() -> None:
+    r = np.asarray(jax.jit(jax.vmap(lambda key: redrawn(key, STEPS, LOW, HIGH)))(jax.random.split(KEY, 400)))
+    assert r.min() >= LOW
+    assert r.max() <= HIGH
+    moving = (np.diff(r, axis=1) != 0).mean(1)
+    assert np.mean(moving == 0) == pytest.approx(0.2 + 0.2 * 0.13, abs=0.06)  # one set-point, or never redrawn
+    assert np.mean((moving > 0) & (moving < 0.3)) == pytest.approx(0.17, abs=0.06)
+    assert np.mean(moving > 0.9) == pytest.approx(0.6, abs=0.08)

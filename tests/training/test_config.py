@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from jaxouter.training.config import PRESETS, from_dict, preset, to_dict
+from jaxouter.training.config import PRESETS, PretrainingConfig, from_dict, preset, to_dict
 
 EVERY = [(plant, name) for plant, presets in PRESETS.items() for name in presets]
 
@@ -34,7 +34,14 @@ def test_paper_preset_is_the_papers(plant, steps):
         ({"devices": 0}, "devices is 0; it must be positive"),
         ({"seeds": 3, "devices": 2}, "devices is 2 and seeds is 3; one must be a multiple of the other"),
         ({"devices": 32}, "environments is 16; it must be a multiple of the 32 devices that each of the 1 seeds gets"),
-        ({"prefill": 160}, "prefill is 160; it must lie between the batch size, 256, and the"),
+        ({"prefill": 160}, "prefill is 160; it must be at least the batch size, 256"),
+        ({"steps": 8_000}, "prefill is 8000; it must be at least the batch size, 256 and less than the 8000 steps"),
+        ({"pretraining": PretrainingConfig()}, "steps is 0; it must be positive, or 0 with pretraining"),
+        ({"pretraining": PretrainingConfig(1, plants=2)}, "pretraining.plants is 2; without randomise it must be 1"),
+        (
+            {"pretraining": PretrainingConfig(1, plants=3), "randomise": (("gain", 0.8, 1.2),)},
+            "pretraining.episodes is 64; it must be a multiple of the 3 plants",
+        ),
         ({"redraw": 1.5}, "redraw is 1.5"),
         ({"noise_sigma": (0.0, 0.1)}, r"noise_sigma is \(0.0, 0.1\)"),
     ],
@@ -58,6 +65,11 @@ def test_configuration_of_before_there_were_devices_has_one():
     values = to_dict(preset("pitch"))
     del values["devices"]
     assert from_dict(values) == preset("pitch")
+
+
+def test_ranges_survive_json():
+    config = replace(preset("pitch"), randomise=(("gain", 0.8, 1.2), ("d1", 0.0, 0.7)))
+    assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
 
 
 def test_last_epoch_may_be_shorter():

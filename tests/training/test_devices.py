@@ -23,6 +23,7 @@ from tests.training.small import small
 HERE = Path(__file__).parent
 OPTIONS = ["--steps", "1040", "--prefill", "640", "--epoch", "8", "--environments", "8", "--replay", "1600"]
 OPTIONS += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
+OPTIONS += ["--pretraining.gradient-steps", "0"]
 
 
 def test_on_four_forced_devices():

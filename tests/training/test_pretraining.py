@@ -10,6 +10,7 @@ from jaxouter import plants
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import identify
 from jaxouter.training.config import PretrainingConfig
+from jaxouter.training.pretraining import Teacher
 from jaxouter.training.run import Run
 from jaxouter.training.train import train
 from jaxouter.training.trainer import build
@@ -26,7 +27,7 @@ def registered(monkeypatch):
 
 @pytest.fixture
 def config():
-    return small("lag", pretraining=START, residual=True, steps=640)
+    return small("lag", pretraining=START, residual=True, steps=0)
 
 
 def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
@@ -46,6 +47,32 @@ def test_the_same_seed_gives_the_same_actor(config):
     jax.tree.map(
         np.testing.assert_array_equal, trainer.start(3, params).learner.actor, trainer.start(3, params).learner.actor
     )
+
+
+def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
+    start = replace(START, episodes=32, plants=8, noise=0.02, load=0.05)
+    trainer, params = build(replace(config, randomise=(("K", 0.3, 0.7), ("T", 0.2, 0.4)), pretraining=start))
+    state = trainer.start(0, params)
+    episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
+    assert float(np.ptp(episodes.params.K)) > 0.3
+    reached = score(trainer.policy, trainer.policy_params(state), episodes)
+    alone = score(*identify.static(*lag.make(), jax.random.key(0)), episodes)
+    assert reached > 0.8 * alone  # both negative
+
+
+def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
+    trainer, _ = build(config)
+    school = Teacher(trainer.env.plant, trainer.policy, noise=0.5, load=0.5)
+    keys = jax.random.split(jax.random.key(0), 400)
+    noise = np.asarray(jax.vmap(lambda key: school._noise(key, 50))(keys))
+    level = noise.std(1)
+    assert np.mean(level == 0) == pytest.approx(0.5, abs=0.08)
+    assert 0.45 < np.sort(level)[-5] < 0.65
+    load = np.asarray(jax.vmap(lambda key: school._load(key, 50))(keys))
+    assert np.mean(np.all(load == 0, 1)) == pytest.approx(0.5, abs=0.08)
+    assert 1.9 < np.abs(load).max() <= 2.0
+    assert np.all((np.diff(load, axis=1) != 0).sum(1) <= 1)
+    assert abs(load[:, -1].mean()) < 0.15
 
 
 def test_a_run_may_end_with_the_start(config, tmp_path):
@@ -90,7 +117,10 @@ def test_a_model_longer_than_half_an_episode_is_refused(config):
         build(replace(config, pretraining=replace(START, lags=26)))
 
 
-@pytest.mark.parametrize(("field", "value"), [("gradient_steps", -1), ("episodes", 0), ("lags", 0), ("batch_size", 0)])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("gradient_steps", -1), ("episodes", 0), ("lags", 0), ("batch_size", 0), ("noise", -1.0), ("load", -1.0)],
+)
 def test_what_is_not_allowed_is_named(field, value):
     with pytest.raises(ValueError, match=rf"pretraining.{field} is {value}"):
         small(pretraining=replace(PretrainingConfig(), **{field: value})).check()

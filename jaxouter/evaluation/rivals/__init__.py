@@ -20,7 +20,6 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.loop import identify
 from jaxouter.loop.policy import Affine, AffineParams, Policy
 from jaxouter.plants import Plant, make
-from jaxouter.training.config import preset
 
 Kind = Literal["rival", "limit", "preview", "learned", "user"]
 CLAIRVOYANT = "clairvoyant"
@@ -69,6 +68,7 @@ RIVALS: dict[str, Rival] = {
     ),
 }
 NAMES = (*RIVALS, CLAIRVOYANT)
+BUDGET = 128_000  # environment steps that identification and tuning of a rival may take
 SIMPLE = ("none", "static")  # what costs next to nothing
 
 
@@ -81,9 +81,8 @@ def identified(name: str, plant_name: str, report: Report = lambda text: None) -
     if name not in RIVALS:
         raise ValueError(f"there is no policy {name!r}; the policies are: {', '.join(RIVALS)}")
     plant, params = make(plant_name)
-    budget = preset(plant_name).steps
 
     def tune() -> Tuned:
-        return RIVALS[name].tune(plant, params, jax.random.key(0), budget, report)
+        return RIVALS[name].tune(plant, params, jax.random.key(0), BUDGET, report)
 
-    return cache.cached(f"{plant_name}-{name}", {"budget": budget}, tune)
+    return cache.cached(f"{plant_name}-{name}", {"budget": BUDGET}, tune)

@@ -21,7 +21,7 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.loop.identify import LEVELS, static
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
-from jaxouter.training.config import preset
+from jaxouter.training.config import TrainConfig, preset
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import ADAM, Teacher, cosine, folded
 from jaxouter.training.trainer import build as build_trainer
@@ -47,19 +47,22 @@ def returns(school: Teacher, actors: Any, prior: AffineParams, plant_params: Any
     return jax.lax.map(mean, actors)
 
 
-def teacher(plant: Plant) -> tuple[Teacher, Any]:
-    """The teacher with the actor of the plant's `default` preset, and the nominal parameters of the plant."""
-    trainer, env = build_trainer(preset(plant.name))
-    return Teacher(plant, trainer.policy, BATCH), env.plant
+def teacher(config: TrainConfig) -> tuple[Teacher, Any]:
+    """The teacher with actor, randomisation and disturbances of a configuration, and the parameters of its plant."""
+    trainer, env = build_trainer(config)
+    start = config.pretraining
+    return Teacher(trainer.env.plant, trainer.policy, BATCH, start.noise, start.load), env.plant
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    """Train three seeds in stages, each twice as long as all before, until a stage gains less than 1 %; the best seed.
-
-    `budget` is no bound: the oracle may take what it needs.
-    """
+    """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
     del budget
-    school, _ = teacher(plant)
+    return train(teacher(preset(plant.name))[0], params, key, report)
+
+
+def train(school: Teacher, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
+    """Train three seeds in stages that double what there is, until one gains less than 1 %; the best seed."""
+    plant = school.plant
     key_static, key_white, key_seeds, key_run, key_test = jax.random.split(key, 5)
     _, prior = static(plant, params, key_static)
     white = school.whitening(prior, params, key_white)
@@ -73,7 +76,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         carry = actors, jax.vmap(ADAM.init)(actors)
         for i in range(0, length, CHUNK):
             key_run, key_chunk = jax.random.split(key_run)
-            carry = school.train(carry, white, prior, params, rates[i : i + CHUNK], key_chunk)
+            carry, _ = school.train(carry, white, prior, params, rates[i : i + CHUNK], key_chunk)
             jax.block_until_ready(carry)
             report(f"stage {stage + 1}, gradient step {gradient_steps + i + CHUNK}")
         actors, gradient_steps = carry[0], gradient_steps + length
@@ -94,8 +97,13 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     return Tuned(settings, arrays, steps)
 
 
-def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
-    """The policy from what `tune` found."""
+def learned(tuned: Tuned) -> LearnedParams:
+    """The policy's parameters from what `train` found."""
     actor = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
     prior = AffineParams(*(jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset")))
-    return teacher(plant)[0].policy, LearnedParams(actor, prior)
+    return LearnedParams(actor, prior)
+
+
+def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
+    """The policy from what `tune` found."""
+    return teacher(preset(plant.name))[0].policy, learned(tuned)

@@ -31,7 +31,7 @@ def test_horizon_is_that_of_the_first_effect_or_a_bit_more(tuned):
 def test_it_beats_the_inner_loop_alone(tuned):
     plant, params = lag.make()
     episodes = training_episodes(plant, params, jax.random.key(1))
-    assert score(*inverse.build(plant, tuned), episodes) > 0.5 * score(*none(plant), episodes)
+    assert score(*inverse.build(plant, tuned), episodes) > 0.55 * score(*none(plant), episodes)
 
 
 def test_asked_for_what_came_it_gives_what_was_applied(tuned):

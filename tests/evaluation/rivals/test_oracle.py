@@ -9,6 +9,7 @@ from jaxouter import plants
 from jaxouter.evaluation.rivals import mpc, oracle, pi
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import identify
+from jaxouter.training.config import preset
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import Whitening, folded
 from tests import lag
@@ -34,7 +35,7 @@ def tuned():
 
 @pytest.fixture(scope="module")
 def school():
-    return oracle.teacher(lag.LAG)[0]
+    return oracle.teacher(preset("lag"))[0]
 
 
 @pytest.fixture(scope="module")

@@ -76,7 +76,7 @@ def test_tuned_beats_the_static_prefilter_and_twice_the_budget_is_worth_little(t
     twice = pi.tune(plant, params, KEY, 2 * BUDGET, lambda text: None)
     episodes = training_episodes(plant, params, jax.random.split(KEY)[1])
     once = score(*pi.build(plant, tuned), episodes)
-    assert once > 0.9 * score(*identify.static(plant, params, KEY), episodes)
+    assert once > 0.92 * score(*identify.static(plant, params, KEY), episodes)
     assert score(*pi.build(plant, twice), episodes) == pytest.approx(once, rel=0.01)
     assert tuned.steps <= BUDGET
     assert twice.steps <= 2 * BUDGET

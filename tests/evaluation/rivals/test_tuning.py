@@ -29,27 +29,25 @@ def test_set_points_fill_the_range_of_the_plant(episodes):
     assert abs(np.mean(episodes.r[:, 0]) - 1.0) < 5 * SPAN / np.sqrt(12 * EPISODES)
 
 
-def test_a_third_is_constant_a_third_redrawn_and_a_third_a_random_walk(episodes):
-    """What is redrawn changes seldom and far, a walk at each step by little; some of the former are never redrawn."""
+def test_a_fifth_is_constant_a_fifth_redrawn_and_the_rest_moves_at_each_step(episodes):
+    """What is redrawn changes seldom and far, the rest at each step; some of the former are never redrawn."""
     r = np.asarray(episodes.r)
     changes = np.count_nonzero(np.diff(r), axis=1)
-    walks, constant = changes > 45, changes == 0
-    redrawn = ~walks & ~constant
-    assert 0.24 < np.mean(walks) < 0.43
-    assert 0.3 < np.mean(constant) < 0.55
-    assert 0.18 < np.mean(redrawn) < 0.4
+    moving, constant = changes > 45, changes == 0
+    redrawn = ~moving & ~constant
+    assert 0.5 < np.mean(moving) < 0.7
+    assert 0.15 < np.mean(constant) < 0.4
+    assert 0.08 < np.mean(redrawn) < 0.28
     assert changes[redrawn].max() < 40
     jumps = np.abs(np.diff(r[redrawn]))
     assert jumps[jumps > 0].mean() == pytest.approx(SPAN / 3, rel=0.15)  # of two levels drawn alike
 
 
-def test_walks_have_steps_from_a_quarter_to_five_percent_of_the_range(episodes):
+def test_what_moves_at_each_step_does_so_from_a_quarter_percent_of_the_range_on(episodes):
     r = np.asarray(episodes.r)
     moves = np.diff(r[np.count_nonzero(np.diff(r), axis=1) > 45]) / SPAN
     deviation = np.sqrt(np.mean(moves**2, axis=1))
-    assert 0.0025 * 0.7 < deviation.min() < 0.005
-    assert 0.025 < deviation.max() < 0.05 * 1.3
-    assert np.abs(moves).max() < 0.25
+    assert 0.0025 * 0.5 < deviation.min() < 0.006
 
 
 def test_episodes_differ_and_another_key_gives_others(episodes):
