@@ -30,7 +30,7 @@ from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
-from jaxouter.training.devices import Fleet
+from jaxouter.training.devices import EIGEN, Fleet
 from jaxouter.training.pretraining import CHUNK
 from jaxouter.training.trainer import Trainer, TrainState, build
 
@@ -74,7 +74,7 @@ class Case:
 
 def repeated(function: Callable[..., Any], state: Any, *args: Any) -> Callable[[], None]:
     """Calls `function(state, *args) -> state, out` again and again: jitted, the state donated, waiting for the end."""
-    jitted = jax.jit(function, donate_argnums=0)
+    jitted = jax.jit(function, donate_argnums=0, compiler_options=EIGEN)
 
     def call() -> None:
         nonlocal state

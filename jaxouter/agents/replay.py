@@ -64,7 +64,10 @@ class Replay:
         return ReplayState(buffer, state.written + 1)
 
     def take_back(self, state: ReplayState) -> tuple[ReplayState, jax.Array]:
-        """The state without the rows (E, width) of the last `write`, and these; writing them again gives it back."""
+        """The state without the rows (E, width) of the last `write`, and these; writing them again gives it back.
+
+        What `sample` draws from it is what it drew before that `write`.
+        """
         position = (state.written - 1) % self.steps + self.mirror
         size = (self.environments, 1, len(self.fields))
         rows = jax.lax.dynamic_slice(state.rows, (0, position, 0), size)[:, 0]
@@ -73,8 +76,8 @@ class Replay:
     def sample(self, state: ReplayState, bits: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.
 
-        At least `window` rows must have been written. Once the ring is full, rows whose lead is already overwritten
-        are not drawn.
+        At least `window` rows must have been written. Once the ring is full, rows whose lead is already overwritten,
+        or will be by the next `write`, are not drawn.
 
         Args:
             state: contents.
@@ -85,7 +88,7 @@ class Replay:
             `lead`, the first transition. Rows that are not valid hold other episodes, or nothing.
         """
         chex.assert_type(bits, jnp.uint32)
-        oldest = jnp.maximum(self.window - 1, state.written - self.steps + self.mirror)
+        oldest = jnp.maximum(self.window - 1, state.written - self.steps + self.mirror + 1)
         environment = (bits[:, 0] % jnp.uint32(self.environments)).astype(jnp.int32)
         # Number of a window's last row. The remainder favours early rows by at most their number over 2^32.
         last = oldest + (bits[:, 1] % (state.written - oldest).astype(jnp.uint32)).astype(jnp.int32)

@@ -28,7 +28,8 @@ from jaxouter.training.trainer import AXIS, Trainer, TrainState, build
 
 SEEDS = "seeds"
 HOUSES = "houses"
-# On CPU devices that share their cores, matrix products by Eigen: a tenth faster than by YNNPACK, jax 0.10's choice.
+# Matrix products on a CPU by Eigen, not by YNNPACK, jax 0.10's choice: a twentieth faster, and a tenth where devices
+# share their cores.
 EIGEN = {"xla_cpu_experimental_ynn_fusion_type": ""}
 Tree = TypeVar("Tree")
 
@@ -257,7 +258,7 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
 
     # Told where its results are, XLA does not choose another layout that would be compiled for once more.
     layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), LAYOUT)
-    several = fleet.mesh.size > 1
+    on_cpu = fleet.mesh.devices.flat[0].platform == "cpu"
 
     @partial(jax.jit, donate_argnums=0, out_shardings=layout, compiler_options=RUN_ONCE)
     def prefill(states: TrainState, params: EnvParams) -> TrainState:
@@ -268,7 +269,7 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
         static_argnums=2,
         donate_argnums=0,
         out_shardings=(layout, NamedSharding(fleet.mesh, SEED)),
-        compiler_options=EIGEN if several and fleet.mesh.devices.flat[0].platform == "cpu" else None,
+        compiler_options=EIGEN if on_cpu else None,
     )
     def epoch(states: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         return mapped(lambda *given: fleet.trainer.epoch(*given, steps), (LAYOUT, SEED))(states, params)

@@ -196,7 +196,8 @@ class Trainer:
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """`steps` environment steps (over all environments of all shards) of exploration and learning.
 
-        The updates of a step draw from the rows of all steps before it. The replay must not be empty.
+        The updates of a step draw from the rows of all steps up to the last but one before it. The replay must hold
+        more than one step.
 
         Returns:
             The state, and means over the epoch: the learner's metrics and `reward` (a step, with exploration).
@@ -211,17 +212,19 @@ class Trainer:
 
         keys_noise, keys_env, keys_batch, keys_update = self.keys(state, steps // environments, 4)
         shape = (cfg.updates, cfg.ddpg.batch_size, 2)
+        bits = jax.vmap(lambda key: jax.random.bits(key, shape, jnp.uint32))(keys_batch)
+        gathered = jax.vmap(self.batch, (None, 0))
         xs = (
             jax.vmap(lambda key: jax.random.normal(key, state.noise.shape, state.noise.dtype))(keys_noise),
             self._keys_env(keys_env),
-            jax.vmap(lambda key: jax.random.bits(key, shape, jnp.uint32))(keys_batch),
+            jnp.roll(bits, -1, 0),  # of the next step
             jax.vmap(lambda key: jax.random.split(key, cfg.updates))(keys_update),
         )
 
-        # The rows of a step are written as the next one begins: so environments and updates need nothing of each other
-        # within a step, and run at the same time.
-        def step(carry: tuple[TrainState, jax.Array], xs: Any) -> tuple[Any, dict[str, jax.Array]]:
-            state, rows = carry
+        # The rows of a step are written, and its successor's batches gathered, as the next one begins: so environments,
+        # updates and batches need nothing of each other within a step, and are made at the same time.
+        def step(carry: tuple[TrainState, jax.Array, Batch], xs: Any) -> tuple[Any, dict[str, jax.Array]]:
+            state, rows, batches = carry
             normal, keys_env, bits, keys_update = xs
             learner, replay = state.learner, self.replay.write(state.replay, rows)
             progress = state.steps.astype(float) / cfg.steps
@@ -230,16 +233,17 @@ class Trainer:
             action = jnp.clip(self.learner.act(learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
             state, rows, reward, done = self.vector_step(state, params, action, keys_env)
 
-            def update(learner: LearnerState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[LearnerState, Any]:
-                bits, key = xs
-                return self.learner.update(learner, self.batch(replay, bits), key)
+            def update(learner: LearnerState, xs: tuple[Batch, chex.PRNGKey]) -> tuple[LearnerState, Any]:
+                return self.learner.update(learner, *xs)
 
-            learner, metrics = jax.lax.scan(update, learner, (bits, keys_update))
+            learner, metrics = jax.lax.scan(update, learner, (batches, keys_update))
             state = state._replace(learner=learner, replay=replay, noise=jnp.where(done, 0.0, explore))
-            return (state, rows), {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
+            metrics = {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
+            return (state, rows, gathered(replay, bits)), metrics
 
         replay, rows = self.replay.take_back(state.replay)
-        (state, rows), metrics = jax.lax.scan(step, (state._replace(replay=replay), rows), xs)
+        carry = state._replace(replay=replay), rows, gathered(replay, bits[0])
+        (state, rows, _), metrics = jax.lax.scan(step, carry, xs)
         state = state._replace(replay=self.replay.write(state.replay, rows))
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics if self.shards == 1 else jax.lax.pmean(metrics, AXIS)

@@ -43,7 +43,7 @@ def test_windows_equal_those_of_a_plain_ring(written, lead, window):
             if same_episode:
                 assert t in kept
                 np.testing.assert_array_equal(row[i], rows_at(t)[e])
-    oldest = 0 if written <= STEPS - replay.mirror else written - STEPS + lead
+    oldest = max(0, written - STEPS + lead + 1)
     assert seen == {(e, t) for e in range(ENVIRONMENTS) for t in range(oldest, written - window + 1)}
 
 
@@ -71,6 +71,10 @@ def test_what_is_taken_back_and_written_again_changes_nothing(written):
     np.testing.assert_array_equal(rows, rows_at(written - 1))
     assert int(before.written) == written - 1
     chex.assert_trees_all_equal(replay.write(before, rows), state)
+    if written > 1:
+        bits = jax.random.bits(jax.random.key(2), (500, 2))
+        (drawn, valid), (then, _) = (replay.sample(s, bits) for s in (before, filled(replay, written - 1)))
+        np.testing.assert_array_equal(drawn[valid], then[valid])
 
 
 def test_a_replay_shorter_than_its_windows_is_refused():

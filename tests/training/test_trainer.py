@@ -8,11 +8,13 @@ from jaxouter.training.devices import Fleet
 from jaxouter.training.trainer import FIELDS, build
 from tests.training.small import small
 
+SMALL = small(replay=640)  # full after the prefill
+
 
 @pytest.fixture(scope="module")
 def filled():
     """Trainer, parameters and a state after the prefill."""
-    trainer, params = build(small())
+    trainer, params = build(SMALL)
     return trainer, params, trainer.prefill(trainer.start(0, params), params)
 
 
@@ -118,12 +120,21 @@ def test_vmapped_seeds_equal_single_runs():
 
 def test_compiled_epoch_copies_no_replay_inside_its_loop(filled):
     _, params, state = filled
-    fleet = Fleet.of(small())
+    fleet = Fleet.of(SMALL)
     text = fleet.epoch.lower(fleet.put([state]), params, 80).compile().as_text()
     shape = ",".join(map(str, state.replay.rows.shape))
     lines = [line for line in text.splitlines() if f"f32[{shape}]" in line or f"f32[1,{shape}]" in line]
     assert lines
     assert sum(" copy(" in line for line in lines) <= 1  # where the loop begins, once an epoch
+
+
+def test_an_epoch_of_a_fleet_is_one_of_its_trainer(filled):
+    """The options with which it is compiled on a CPU change no result."""
+    trainer, params, state = filled
+    fleet = Fleet.of(SMALL)
+    found, _ = fleet.epoch(fleet.put([copy(state)]), params, 400)
+    expected, _ = trainer.epoch(copy(state), params, 400)
+    chex.assert_trees_all_close(jax.tree.map(lambda leaf: leaf[0], found.learner), expected.learner, atol=1e-6)
 
 
 def test_exploration_stays_within_the_bounds_of_r_tilde():
