@@ -31,7 +31,6 @@ from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 from jaxouter.training.devices import EIGEN, Fleet
-from jaxouter.training.pretraining import CHUNK
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 SGEMM, NORMALS = "sgemm_gflops", "normals_per_s"
@@ -356,11 +355,11 @@ def seeds_at_once(seeds: int) -> Job:
 
 
 def first_epoch(config: TrainConfig) -> Callable[[], Any]:
-    """Everything up to the first epoch, or the first `CHUNK` gradient steps of pretraining.
+    """Everything up to the first epoch, or the first gradient steps of pretraining.
 
-    Prefill and epoch are so short that nearly all of it is compilation.
+    They, prefill and epoch are so few that nearly all of it is compilation.
     """
-    start = replace(config.pretraining, gradient_steps=min(config.pretraining.gradient_steps, CHUNK))
+    start = replace(config.pretraining, gradient_steps=min(config.pretraining.gradient_steps, 5))
     config = replace(config, prefill=max(config.ddpg.batch_size, 10 * config.environments), pretraining=start)
 
     def call() -> None:

@@ -76,6 +76,13 @@ def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Recor
     Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
     log-uniform from four times an episode to every other step.
     """
+    r_tilde, y = _episodes(plant, params, jax.random.split(key, episodes))
+    return Record(np.asarray(r_tilde, np.float64), np.asarray(y, np.float64))
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
+def _episodes(plant: Plant, params: Any, keys: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+    """r~ (episodes, T) and y (episodes, T + 1)."""
 
     def episode(key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
         key_start, key_rate, key_levels, key_run = jax.random.split(key, 4)
@@ -87,8 +94,7 @@ def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Recor
         y = simulate(plant, params, r_tilde, key_run, state)
         return r_tilde, jnp.concatenate([y0[None], y])
 
-    r_tilde, y = jax.vmap(episode)(jax.random.split(key, episodes))
-    return Record(np.asarray(r_tilde, np.float64), np.asarray(y, np.float64))
+    return jax.vmap(episode)(keys)
 
 
 class ARX(NamedTuple):

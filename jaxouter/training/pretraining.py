@@ -94,7 +94,7 @@ class Teacher:
         step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
         return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
 
-    @partial(jax.jit, static_argnums=0)
+    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
     def whitening(self, prior: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
         """From the observations under an actor whose action is zero."""
         zero = jax.tree.map(jnp.zeros_like, self.policy.learner.init(key).actor)
@@ -155,7 +155,7 @@ def folded(actor: Any, white: Whitening) -> Any:
 
 def cosine(steps: int) -> jax.Array:
     """Learning rates (steps,), falling to zero along a cosine."""
-    return RATE * (1.0 + jnp.cos(jnp.pi * jnp.arange(steps, dtype=float) / steps)) / 2
+    return jnp.asarray(RATE * (1.0 + np.cos(np.pi * np.arange(steps) / steps)) / 2, float)
 
 
 def pretrain(
@@ -163,7 +163,7 @@ def pretrain(
     plant: Plant,
     plant_params: Any,
     policy: LearnedPolicy,
-    prior: AffineParams,
+    learned: LearnedParams,
     key: chex.PRNGKey,
     report: Callable[[int], None] = lambda done: None,
 ) -> Any:
@@ -175,12 +175,12 @@ def pretrain(
     Args:
         config: how many of both.
         plant, plant_params: only recorded from, through r~ and y.
-        policy: gives the actor its shape.
-        prior: of the policy.
+        policy, learned: what to begin with; an actor whose first layer takes the whitened observation.
         key: random numbers.
         report: called with the gradient steps done (progress).
     """
-    key_record, key_white, key_actor, key_run = jax.random.split(key, 4)
+    key_record, key_white, key_run = jax.random.split(key, 3)
+    prior = learned.prior
     lags = config.lags or policy.observer.history
     models = []
     for key_plant in jax.random.split(key_record, config.plants):
@@ -190,7 +190,7 @@ def pretrain(
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
     school = Teacher(counterfactual.plant(plant, lags), policy, config.batch_size, config.noise, config.load)
     white = school.whitening(prior, model, key_white)
-    actors = jax.tree.map(lambda leaf: leaf[None], policy.learner.init(key_actor).actor)
+    actors = jax.tree.map(lambda leaf: leaf[None], learned.actor)
     carry = actors, jax.vmap(ADAM.init)(actors)
     rates, best, trail = cosine(config.gradient_steps), -np.inf, [carry]
     for begin in range(0, config.gradient_steps, CHUNK):

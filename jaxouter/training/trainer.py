@@ -80,8 +80,9 @@ class Trainer:
             state = state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
         if self.config.pretraining.gradient_steps:
             key_start = jax.random.fold_in(key_prior, PRETRAINING)
+            begin = self.policy_params(state)
             actor = pretrain(
-                self.config.pretraining, self.env.plant, params.plant, self.policy, state.prior, key_start, report
+                self.config.pretraining, self.env.plant, params.plant, self.policy, begin, key_start, report
             )
             target = jax.tree.map(jnp.copy, actor)  # the state is donated, and no buffer twice
             state = state._replace(learner=state.learner._replace(actor=actor, target_actor=target))
