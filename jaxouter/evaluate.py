@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             scenario = scenarios.get(name, options.episodes, options.family_seed)
             results |= evaluate(policies[scenario.plant.name], [scenario])
     named = next(iter(policies.values()))
-    show(named.name, results)
+    show(named.name, results, origin.get("places", {}))
     if options.json is not None:
         episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
         write_json(options.json, result(named, results, **origin, family_seed=options.family_seed, episodes=episodes))
@@ -123,16 +123,22 @@ def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
     state, _ = run.load(seed)
     trainer, _ = run.trainer
     named = Named("learned", trainer.policy, trainer.policy_params(state))
-    return {run.config.plant: named}, {"run": str(run.path), "seed": seed}
+    origin: dict[str, Any] = {"run": str(run.path), "seed": seed}
+    if run.config.randomise:
+        met = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
+        origin["places"] = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
+    return {run.config.plant: named}, origin
 
 
-def show(policy: str, results: Results) -> None:
-    """Print the table."""
+def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
+    """Print the table; with where each plant lies among those of the training, where that is known."""
     rows = [
-        [name, *("diverged" if figures.get("diverged") else cli.number(figures[key]) for key in SHOWN)]
+        [name, *filter(None, [places.get(name)])]
+        + ["diverged" if figures.get("diverged") else cli.number(figures[key]) for key in SHOWN]
         for name, (_, figures) in results.items()
     ]
-    cli.table(f"policy {policy}", ["scenario", *(key.replace("_", " ") for key in SHOWN)], rows)
+    columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]
+    cli.table(f"policy {policy}", columns, rows)
 
 
 if __name__ == "__main__":

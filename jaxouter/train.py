@@ -6,6 +6,7 @@ import dataclasses
 import statistics
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -93,6 +94,8 @@ def main(arguments: list[str] | None = None) -> None:
         if first:
             seeds = ", ".join(map(str, run.seeds))
             print(f"{config.plant}, preset {config.preset}, seeds {seeds} -> {run.path}")
+            for name, low, high in config.randomise:
+                print(f"each plant has its own {name}, from {low:g} to {high:g}")
         with cli.Interrupt() as interrupt:
             watched = scenarios.get(scenarios.paper_scenarios(run.config.plant)[0])
 
@@ -116,6 +119,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, _) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
+    places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
     simple_results = {name: evaluate(named, met, record_members=True) for name, named in simple.items()}
@@ -129,13 +133,14 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
         "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
         / run.config.side_by_side,
         "steps": run.config.steps,
-        "identification_steps": run.config.environment_steps - run.config.steps,
+        "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
+        "places": places,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
     }
     write_json(run.path / "summary.json", summary)
-    show(met, simple_results, learned)
+    show(met, simple_results, learned, places if run.config.randomise else {})
     print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 
@@ -154,8 +159,13 @@ def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], le
     return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
 
 
-def show(met: list[scenarios.Scenario], simple: dict[str, Results], learned: dict[int, Results]) -> None:
-    """Print the table; with several seeds the median, least and largest MAE."""
+def show(
+    met: list[scenarios.Scenario],
+    simple: dict[str, Results],
+    learned: dict[int, Results],
+    places: Mapping[str, str],
+) -> None:
+    """Print the table; with several seeds the median, least and largest MAE. Places are shown where there are any."""
     rows = []
     for scenario in met:
         of_seeds = [results[scenario.id][1] for results in learned.values()]
@@ -167,10 +177,14 @@ def show(met: list[scenarios.Scenario], simple: dict[str, Results], learned: dic
         paper = "-" if scenario.paper is None else f"{scenario.paper[1]:.2f} of {scenario.paper[0]:.2f}"
         inner, static = (simple[name][scenario.id][1]["mae"] for name in ("none", "static"))
         improvement = cli.number(statistics.median(better), 1) if better else "-"
-        rows.append([scenario.id, cli.number(inner), cli.number(static), paper, ours, improvement])
+        place = [places[scenario.id]] if places else []
+        rows.append([scenario.id, *place, cli.number(inner), cli.number(static), paper, ours, improvement])
     unit = met[0].plant.y_unit
-    columns = ["scenario", "inner loop alone", "static prefilter", "paper's DRL", "ours", "improvement, %"]
+    columns = ["scenario", *(["plant"] if places else [])]
+    columns += ["inner loop alone", "static prefilter", "paper's DRL", "ours", "improvement, %"]
     cli.table(f"MAE in {unit}", columns, rows)
+    if places:
+        print("plant: where it lies among those of the training")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ def command(module: str, *arguments: str, cwd: Path) -> subprocess.CompletedProc
 def trained(tmp_path_factory):
     """Output and folder of a small run of two seeds on the heaters, through the real entry point."""
     folder = tmp_path_factory.mktemp("train")
-    done = command("train", "heaters", *SMALL, "--seed", "3", "--seeds", "2", cwd=folder)
+    drawn = ["--randomise", "x_out", "-12", "0"]
+    done = command("train", "heaters", *SMALL, *drawn, "--seed", "3", "--seeds", "2", cwd=folder)
     assert done.returncode == 0, done.stderr
     return done, folder / "runs" / "heaters-default-3"
 
@@ -53,6 +54,7 @@ def test_train_writes_the_run_folder(trained):
     assert [(r["policy"], r.get("seed")) for r in summary["results"]] == [
         ("learned", 3), ("learned", 4), ("none", None), ("static", None)
     ]  # fmt: skip
+    assert summary["places"] == {"heaters/paper-4": "inside", "heaters/paper-1000": "inside"}
 
 
 def test_train_ends_with_the_table_and_the_main_figure(trained):
@@ -64,6 +66,8 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
         "static prefilter",
         "1.17 of 15.62",
         "15.59",
+        "each plant has its own x_out, from -12 to 0",
+        "inside",
     ):
         assert text in done.stdout
     assert done.stdout.rstrip().endswith(str(Path("runs") / folder.name / "figures" / "paper.png"))
@@ -83,6 +87,14 @@ def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):
     expected = [result["scenarios"]["heaters/paper-4"]["mae"] for result in summary["results"][:2]]
     assert [maes["seed-3"], maes["seed-4"]] == pytest.approx(expected, rel=1e-4)
     assert maes["run"] == pytest.approx(min(expected), rel=1e-4)
+
+
+def test_evaluate_says_where_plants_lie_among_those_of_the_training(trained, capsys):
+    scenarios = ["heaters/paper-4", "heaters/cold"]
+    evaluate.main([str(trained[1]), "--scenario", *scenarios, "--episodes", "1"])
+    lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines() if "heaters/" in line}
+    assert ["inside" in lines[name] for name in scenarios] == [True, False]
+    assert "outside" in lines["heaters/cold"]
 
 
 def test_evaluate_through_its_entry_point_writes_figures_and_traces(tmp_path):
@@ -116,7 +128,7 @@ def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
     ("arguments", "text"),
     [
         (["submarine"], "no plant 'submarine'; the plants are: pitch, heaters"),
-        (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, paper"),
+        (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, robust, paper"),
         (["--steps", "-5"], "steps is -5; it must be positive, or 0 with pretraining"),
         (["--seeds", "0"], "seeds is 0; it must be positive"),
         (["--replay", "100"], "replay is 100; it must hold at least a batch of 256"),

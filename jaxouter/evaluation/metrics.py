@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxouter.evaluation.rollout import Traces, excess
 from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.plants import Plant
 
 BAND = 0.05  # of the step, for the settling time
 ROUNDING = 1e-4  # in the unit of y, by which a limit that is just met may be exceeded
@@ -18,6 +19,13 @@ ROUNDING = 1e-4  # in the unit of y, by which a limit that is just met may be ex
 def mae(traces: Traces) -> float:
     """Mean of |r_k - y_(k+1)| over steps and episodes, the paper's measure."""
     return float(np.mean(np.abs(traces.r - traces.y)))
+
+
+def held(traces: Traces, plant: Plant) -> float:
+    """Share of the episodes in the second half of which |y| never exceeds the plant's limit (else: its divergence)."""
+    late = np.abs(traces.y[:, traces.y.shape[1] // 2 :])
+    bound = plant.output_limit or max(map(abs, plant.divergence_bounds))
+    return float(np.mean(np.all(late <= bound, axis=1)))
 
 
 def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None = None) -> dict[str, Any]:

@@ -186,6 +186,17 @@ def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_
     return builder(identifier, family_seed)(episodes)
 
 
+def perturbed(identifier: str, steps: int = 600, episodes: int = 64) -> Scenario:
+    """A scenario from starts drawn as in training, its last reference held until there are so many steps."""
+    scenario = get(identifier, episodes)
+    return replace(
+        scenario,
+        plant=replace(scenario.plant, init=scenario.plant.training_start),
+        r=jnp.pad(scenario.r, ((0, 0), (0, steps - scenario.r.shape[1])), mode="edge"),
+        keys=jax.random.split(jax.random.key(3), episodes),
+    )
+
+
 def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
     """Where a scenario lies among the plants of a training under domain randomisation.
 
@@ -198,23 +209,27 @@ def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
         'outside' where any number is outside of what training drew, else 'edge' where one that is drawn has its least
         or greatest value, else 'inside'. How many houses there are and where they start counts for nothing.
     """
-    drawn = {name: (low, high) for name, low, high in ranges}
-    bounds: dict[str, Any] = {name: (leaf, leaf) for name, leaf in _numbers(make(scenario.plant.name)[1]).items()}
-    bounds |= drawn | {"noise": (0.0, noise)}
+    bounds = {name: (leaf.copy(), leaf.copy()) for name, leaf in _numbers(make(scenario.plant.name)[1]).items()}
+    for name, *ends in ranges:
+        field, _, element = name.partition("[")
+        for bound, end in zip(bounds[field], ends, strict=True):
+            bound[int(element[:-1]) if element else ...] = end
+    bounds["noise"] = np.zeros(()), np.asarray(noise)
     found = [("noise", np.asarray(scenario.sensor.noise)), *_numbers(scenario.params).items()]
     found += [] if scenario.change is None else list(_numbers(scenario.change[1]).items())
     edge = False
     for name, leaf in found:
-        low, high = (np.asarray(end) for end in bounds[name])
+        low, high = bounds[name]
         if np.any(leaf < low - ROUNDING) or np.any(leaf > high + ROUNDING):
             return "outside"
-        edge |= name in drawn and bool(np.any((leaf < low + ROUNDING) | (leaf > high - ROUNDING)))
+        if name != "noise":
+            edge |= bool(np.any((low < high) & ((leaf < low + ROUNDING) | (leaf > high - ROUNDING))))
     return "edge" if edge else "inside"
 
 
 def _numbers(params: Any) -> dict[str, np.ndarray]:
     """Leaves by their names, but for those of the start."""
-    leaves = {path[-1].name: np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
+    leaves = {path[-1].name: np.array(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
     return {name: leaf for name, leaf in leaves.items() if name not in OF_THE_START}
 
 

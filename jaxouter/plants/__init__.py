@@ -19,6 +19,7 @@ __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simu
 Ranges = tuple[tuple[str, float, float], ...]
 """Names of a plant's numbers, and between what each is drawn."""
 
+SHORT = 4  # elements of a vector that have names
 REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
 
 
@@ -53,6 +54,18 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
     return maker(**overrides)
 
 
+def numbers(params: Any) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """The numbers among a plant's parameters, elements of short vectors too: name -> which leaf, and where in it."""
+    found: dict[str, tuple[int, tuple[int, ...]]] = {}
+    for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(params)):
+        name = getattr(path[-1], "name", "")
+        if jax.numpy.ndim(leaf) == 0:
+            found[name] = i, ()
+        elif jax.numpy.ndim(leaf) == 1 and len(leaf) <= SHORT:
+            found |= {f"{name}[{j}]": (i, (j,)) for j in range(len(leaf))}
+    return found
+
+
 def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
     """The plant with some of its numbers drawn anew for each episode, uniformly (domain randomisation).
 
@@ -60,7 +73,7 @@ def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
 
     Args:
         plant, params: as `make` returns them.
-        ranges: fields of the parameters that are numbers, each with its least and greatest value.
+        ranges: numbers among the parameters, such as `gain` or `W[1]`, each with its least and greatest value.
 
     Returns:
         The plant, which now has a `draw`, and parameters in which what is not drawn is as it was.
@@ -69,25 +82,21 @@ def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
         ValueError: a name is not one of the plant's numbers (lists those), or a range is none.
     """
     named = {name: (low, high) for name, low, high in ranges}
-    names = [
-        getattr(path[-1], "name", "") if jax.numpy.ndim(leaf) == 0 else ""
-        for path, leaf in jax.tree_util.tree_leaves_with_path(params)
-    ]
+    known = numbers(params)
     for name, (low, high) in named.items():
-        if name not in names:
-            known = ", ".join(sorted(filter(None, names)))
-            raise ValueError(f"plant {plant.name!r} has no number {name!r} to draw; it has: {known}")
+        if name not in known:
+            raise ValueError(f"plant {plant.name!r} has no number {name!r} to draw; it has: {', '.join(sorted(known))}")
         if not low <= high:
             raise ValueError(f"the range of {name} is {low:g} to {high:g}; the first must not be above the second")
 
     def draw(key: chex.PRNGKey, params: Any) -> Any:
         leaves, structure = jax.tree.flatten(params)
-        shares = dict(zip(named, jax.random.uniform(key, (len(named),), float), strict=True))
-        drawn = [
-            leaf if name not in named else named[name][0] + (named[name][1] - named[name][0]) * shares[name]
-            for name, leaf in zip(names, leaves, strict=True)
-        ]
-        return jax.tree.unflatten(structure, drawn)
+        for share, (name, (low, high)) in zip(
+            jax.random.uniform(key, (len(named),), float), named.items(), strict=True
+        ):
+            leaf, element = known[name]
+            leaves[leaf] = leaves[leaf].at[element].set(low + (high - low) * share)
+        return jax.tree.unflatten(structure, leaves)
 
     return replace(plant, draw=draw), plant.widened(params, named)
 

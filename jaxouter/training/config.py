@@ -23,6 +23,8 @@ class PretrainingConfig:
     """Episodes of the plant that are recorded under random r~, besides --steps."""
     plants: int = 1
     """Plants of which they are, each drawn from --randomise; more than one needs it."""
+    episode_steps: int | None = None
+    """Control steps of a recorded episode, and so of one on the model; None: an episode of the plant."""
     lags: int | None = None
     """Past samples of r~ and y in the model; None: as many as the observation holds."""
     batch_size: int = 64
@@ -31,15 +33,18 @@ class PretrainingConfig:
     """Largest standard deviation of the measurement noise that half of these have; 1 is half the set-point range."""
     load: float = 0.0
     """Largest unseen step of r~, at a random time, that half of these have; 1 is half the range of r~."""
+    log_above: float = 0.0
+    """Cost a step c above which episodes count less, as c log(1 + cost / c): so those of plants that are hard to hold
+    don't outweigh all others; 0: each counts in full."""
 
     def check(self) -> None:
         """Raises ValueError, naming field, value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
-        for name in ("noise", "load"):
+        for name in ("noise", "load", "log_above"):
             if getattr(self, name) < 0:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must not be negative")
-        for name in ("episodes", "plants", "lags", "batch_size"):
+        for name in ("episodes", "plants", "episode_steps", "lags", "batch_size"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must be at least 1")
 
@@ -170,15 +175,16 @@ class TrainConfig:
         return max(0, -(-(self.steps - self.prefill) // self.epoch))
 
     @property
-    def identification_episodes(self) -> int:
-        """Episodes recorded before the training, of each seed."""
-        recorded = self.pretraining.episodes if self.pretraining.gradient_steps else 0
-        return recorded + (LEVELS if self.residual else 0)
+    def identification_steps(self) -> int:
+        """Control steps recorded before the training, of each seed."""
+        plant, start = plants.make(self.plant)[0], self.pretraining
+        recorded = start.episodes * (start.episode_steps or plant.episode_steps) if start.gradient_steps else 0
+        return recorded + (LEVELS * plant.episode_steps if self.residual else 0)
 
     @property
     def environment_steps(self) -> int:
         """Control steps of the plant that one seed sees, identification included."""
-        return self.steps + self.identification_episodes * plants.make(self.plant)[0].episode_steps
+        return self.steps + self.identification_steps
 
     @property
     def total_updates(self) -> int:
@@ -215,17 +221,49 @@ DEFAULT = TrainConfig(
         saturation_penalty=1e-3,
     ),
 )
+HEATERS = replace(
+    DEFAULT,
+    plant="heaters",
+    integral_steps=None,
+    reward_scale=1.0,
+    pretraining=replace(DEFAULT.pretraining, noise=0.02, load=0.2),
+    ddpg=replace(DEFAULT.ddpg, discount=0.95),
+)
+ROBUST_PITCH = replace(
+    DEFAULT,
+    preset="robust",
+    history=80,  # longer than the longest delay
+    randomise=(
+        ("tau", 0.3, 0.7),
+        ("d1", 0.0, 0.8),
+        ("d2", 0.0, 6.0),
+        ("gain", 0.8, 1.2),
+        ("W[0]", 0.0, 0.2),
+        ("W[1]", -0.01, 0.01),
+        ("W[2]", -0.01, 0.01),
+    ),
+    pretraining=replace(
+        DEFAULT.pretraining, gradient_steps=7_500, episodes=512, plants=128, episode_steps=400, log_above=1.0
+    ),
+)
+ROBUST_HEATERS = replace(
+    HEATERS,
+    preset="robust",
+    history=20,
+    randomise=(
+        ("Pi", 0.3, 18.0),
+        ("x_out", -20.0, 5.0),
+        ("Ca", 7.0, 13.0),
+        ("Ua", 0.14, 0.26),
+        ("sigma", 0.0, 0.3),  # of four houses: the noise of their mean is that of any number of them
+    ),
+    pretraining=replace(HEATERS.pretraining, gradient_steps=5_000, episodes=1_024, plants=128),
+)
 PRESETS: dict[str, dict[str, TrainConfig]] = {
-    "pitch": {"default": DEFAULT, "paper": PAPER},
+    "pitch": {"default": DEFAULT, "robust": ROBUST_PITCH, "paper": PAPER},
     "heaters": {
-        "default": replace(
-            DEFAULT,
-            plant="heaters",
-            integral_steps=None,
-            reward_scale=1.0,
-            pretraining=replace(DEFAULT.pretraining, noise=0.02, load=0.2),
-            ddpg=replace(DEFAULT.ddpg, discount=0.95),
-        ),
+        "default": HEATERS,
+        "robust": ROBUST_HEATERS,
         "paper": replace(PAPER, plant="heaters", steps=400_000),
     },
 }

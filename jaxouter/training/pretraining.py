@@ -10,7 +10,7 @@ little, and the small differences are what tells the state of the plant.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ RATE = 3e-3  # learning rate at first
 CLIP = 0.1  # of the gradient's norm; below what is usual, so that a batch in which the loop was unstable counts no more
 CHUNK = 50  # gradient steps between two reports
 LAST, COLLAPSED = 5, 2.0  # where these steps' mean reward is so many times the best one, the loop has become unstable
+SHORT = 1 / 3  # of the gradient steps, with episodes no longer than the plant's
 FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 
 
@@ -53,6 +54,13 @@ class Teacher:
     """Largest standard deviation of the measurement noise, in half of the episodes; 1 is half the set-point range."""
     load: float = 0.0
     """Largest unseen step of r~, at a random time in half of the episodes; 1 is half the range of r~."""
+    log_above: float = 0.0
+    """Cost a step above which episodes count by its logarithm; 0: all count in full."""
+
+    @classmethod
+    def of(cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int) -> Teacher:
+        """The teacher with the disturbances and the cost of a configuration."""
+        return cls(plant, policy, batch, config.noise, config.load, config.log_above)
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward a step, and the policy's carries (T, ...) with r and y (T,)."""
@@ -120,12 +128,13 @@ class Teacher:
             key: episodes, the same for all seeds.
 
         Returns:
-            carry, and the mean reward that each step began with (n, seeds).
+            carry, and the mean reward that each step began with, as it counts (n, seeds).
         """
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
             params = LearnedParams(folded(actor, white), prior)
-            return -jnp.mean(jax.vmap(lambda key: self.episode(self.policy, params, plant_params, key)[0])(keys))
+            cost = jax.vmap(lambda key: -self.episode(self.policy, params, plant_params, key)[0])(keys)
+            return jnp.mean(self.log_above * jnp.log1p(cost / self.log_above) if self.log_above else cost)
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
             cost, gradient = jax.value_and_grad(loss)(actor, keys)
@@ -180,7 +189,8 @@ def pretrain(
         report: called with the gradient steps done (progress).
     """
     key_record, key_white, key_run = jax.random.split(key, 3)
-    prior = learned.prior
+    prior, natural = learned.prior, plant.episode_steps
+    plant = replace(plant, episode_steps=config.episode_steps or natural)
     lags = config.lags or policy.observer.history
     models = []
     for key_plant in jax.random.split(key_record, config.plants):
@@ -188,16 +198,19 @@ def pretrain(
         data = identify.record(plant, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    school = Teacher(counterfactual.plant(plant, lags), policy, config.batch_size, config.noise, config.load)
-    white = school.whitening(prior, model, key_white)
+    school = Teacher.of(config, counterfactual.plant(plant, lags), policy, config.batch_size)
+    # What is unstable shows late: whole episodes follow, where they are longer than the plant's, when those can be won.
+    short = replace(school, plant=replace(school.plant, episode_steps=min(natural, plant.episode_steps)))
+    longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK if plant.episode_steps > natural else 0
+    white = short.whitening(prior, model, key_white)
     actors = jax.tree.map(lambda leaf: leaf[None], learned.actor)
     carry = actors, jax.vmap(ADAM.init)(actors)
     rates, best, trail = cosine(config.gradient_steps), -np.inf, [carry]
     for begin in range(0, config.gradient_steps, CHUNK):
-        chunk = rates[begin : begin + CHUNK]
-        carry, reward = school.train(carry, white, prior, model, chunk, jax.random.fold_in(key_run, begin))
+        chunk, now = rates[begin : begin + CHUNK], short if begin < longer else school
+        carry, reward = now.train(carry, white, prior, model, chunk, jax.random.fold_in(key_run, begin))
         reward = np.asarray(reward)[:, 0]
-        best, reached = max(best, reward[0]), reward[-LAST:].mean()
+        best, reached = reward[0] if begin == longer else max(best, reward[0]), reward[-LAST:].mean()
         if reached > COLLAPSED * best:  # both negative
             best, trail = max(best, reached), [*trail[-1:], carry]
         else:

@@ -15,6 +15,7 @@ import jax
 
 import jaxouter
 from jaxouter.loop.environment import EnvParams
+from jaxouter.plants import Ranges
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
 from jaxouter.training.devices import Fleet
@@ -92,6 +93,11 @@ class Run:
     def trainer(self) -> tuple[Trainer, EnvParams]:
         """The trainer of the configuration and the parameters of its environments."""
         return build(self.config)
+
+    @property
+    def drawn(self) -> tuple[Ranges, float]:
+        """The numbers of the plant that training drew, and the largest standard deviation of its measurement noise."""
+        return self.config.randomise, self.config.pretraining.noise * self.trainer[0].env.observer.y_scale
 
     @cached_property
     def fleet(self) -> Fleet:

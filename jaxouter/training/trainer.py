@@ -265,12 +265,10 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         goal=SetPoint(*plant.setpoint_range, config.redraw),
         drawn=config.randomise,
     )
-    lags = config.pretraining.lags or env.observer.history
-    if config.pretraining.gradient_steps and lags > plant.episode_steps // 2:
-        raise ValueError(
-            f"pretraining.lags is {lags}; it must be at most half an episode of {config.plant}, "
-            f"{plant.episode_steps // 2}"
-        )
+    start = config.pretraining
+    lags, most = start.lags or env.observer.history, (start.episode_steps or plant.episode_steps) // 2
+    if start.gradient_steps and lags > most:
+        raise ValueError(f"pretraining.lags is {lags}; it must be at most half a recorded episode, {most}")
     # The replay never holds more than there is, and little where nothing is learned from it.
     least = 2 * (env.observer.history + config.ddpg.n_step)
     per_environment = max(least, min(config.replay, config.steps) // config.environments)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.metrics import figures_of_merit, held
 from jaxouter.evaluation.rollout import Traces
 
 PITCH, HEATERS = scenarios.get("pitch/paper"), scenarios.get("heaters/paper-4", 1)  # steps of 0.1 s and of 1 h
@@ -26,6 +26,12 @@ def test_errors_and_their_integrals_by_hand():
     assert out["itae"] == pytest.approx(0.1 * (0.1 * 2 + 0.2 * 1 + 0.4 * 2))
     assert out["overshoot"] == pytest.approx(100.0)
     assert out["return"] == pytest.approx(-5.0)
+
+
+def test_held_is_what_stays_within_the_limit_in_the_second_half():
+    episodes = traces(np.zeros((3, 4)), [[99, 99, -18, 18], [0, 0, 0, 18.1], [0, 0, np.nan, 0]])
+    assert held(episodes, PITCH.plant) == pytest.approx(1 / 3)
+    assert held(traces(np.zeros(4), [99, 99, 59, 20]), HEATERS.plant) == 1.0  # no limit: divergence
 
 
 def test_settling_time_is_when_the_error_stays_within_5_percent_of_the_step():

@@ -97,6 +97,16 @@ def test_unknown_scenario_lists_those_that_exist():
         scenarios.get("pitch/papers")
 
 
+def test_perturbed_starts_are_those_of_the_training_and_the_last_set_point_is_held():
+    scenario = scenarios.perturbed("pitch/delay-swapped", 250, 8)
+    assert scenario.r.shape == (8, 250)
+    np.testing.assert_array_equal(scenario.r, scenarios.get("pitch/delay-swapped").r[0, 0])
+    np.testing.assert_allclose(scenario.params.d2, 5.7)
+    traces = rollout(*none(scenario.plant), scenario)
+    assert np.ptp(traces.y0) > 2.0
+    assert np.abs(traces.y0).max() <= 5.0
+
+
 PITCH_RANGES = (("tau", 0.3, 0.7), ("d1", 0.0, 0.57), ("d2", 0.0, 6.0))
 HEATERS_RANGES = (("Pi", 0.3, 2.0), ("x_out", -15.0, 0.0), ("Ca", 7.0, 13.0), ("Ua", 0.14, 0.26))
 
@@ -110,6 +120,8 @@ HEATERS_RANGES = (("Pi", 0.3, 2.0), ("x_out", -15.0, 0.0), ("Ca", 7.0, 13.0), ("
         ("pitch/delay-swapped", (("d1", 0.0, 1.0), ("d2", 0.0, 6.0)), 0.0, "inside"),
         ("pitch/delay-5.7", PITCH_RANGES, 0.0, "outside"),
         ("pitch/uncertainty", PITCH_RANGES, 0.0, "outside"),
+        ("pitch/uncertainty", (("W[1]", 0.0, 0.4), ("W[2]", -0.3, 0.3)), 0.0, "edge"),
+        ("pitch/uncertainty", (("W[1]", 0.0, 0.4), ("W[2]", -0.2, 0.2)), 0.0, "outside"),
         ("pitch/load", (("disturbance", -3.0, 3.0),), 0.0, "inside"),
         ("pitch/load", (("disturbance", -3.0, 1.0),), 0.0, "outside"),
         ("pitch/noise", (), 0.1, "outside"),

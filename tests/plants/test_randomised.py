@@ -31,6 +31,15 @@ def test_what_is_named_is_drawn_over_its_range_and_the_rest_stays(name, ranges):
         np.testing.assert_array_equal(values, np.broadcast_to(given[field], values.shape))
 
 
+def test_elements_of_a_vector_are_numbers_too():
+    plant, params = randomised(*make("pitch"), (("W[1]", -0.02, 0.02), ("W[2]", 0.5, 0.5)))
+    W = np.asarray(draws(plant, params).W)
+    np.testing.assert_array_equal(W[:, 0], params.W[0])
+    assert -0.02 <= W[:, 1].min() < -0.015
+    assert 0.015 < W[:, 1].max() <= 0.02
+    np.testing.assert_array_equal(W[:, 2], 0.5)
+
+
 def test_numbers_are_drawn_apart():
     plant, params = randomised(*make("pitch"), (("gain", 0.0, 1.0), ("d1", 0.0, 1.0)))
     drawn = draws(plant, params)
@@ -48,7 +57,7 @@ def test_a_drawn_delay_acts_as_one_that_was_given():
 @pytest.mark.parametrize(
     ("ranges", "text"),
     [
-        ((("d3", 0.0, 1.0),), "plant 'pitch' has no number 'd3' to draw; it has: A_h, B_h, "),
+        ((("d3", 0.0, 1.0),), r"plant 'pitch' has no number 'd3' to draw; it has: A_h, B\[0\], "),
         ((("W", 0.0, 1.0),), "no number 'W'"),
         ((("gain", 1.2, 0.8),), "the range of gain is 1.2 to 0.8; the first must not be above the second"),
         ((("d1", -0.1, 0.5),), "the range of d1 is -0.1 to 0.5 s; a delay must not be negative"),

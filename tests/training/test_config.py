@@ -52,7 +52,7 @@ def test_errors_name_field_value_and_what_is_allowed(change, text):
 
 
 def test_unknown_preset_lists_those_that_exist():
-    with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, paper"):
+    with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, robust, paper"):
         preset("heaters", "fast")
 
 

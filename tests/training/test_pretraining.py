@@ -8,15 +8,16 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
-from jaxouter.loop import identify
+from jaxouter.loop import counterfactual, identify
 from jaxouter.training.config import PretrainingConfig
-from jaxouter.training.pretraining import Teacher
+from jaxouter.training.pretraining import ADAM, Teacher, Whitening
 from jaxouter.training.run import Run
 from jaxouter.training.train import train
 from jaxouter.training.trainer import build
 from tests import lag
 from tests.training.small import small
 
+KEY = jax.random.key(0)
 START = PretrainingConfig(gradient_steps=100, episodes=8, lags=4, batch_size=16)
 
 
@@ -58,6 +59,39 @@ def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
     alone = score(*identify.static(*lag.make(), jax.random.key(0)), episodes)
     assert reached > 0.8 * alone  # both negative
+
+
+def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config, monkeypatch):
+    lengths, learn = [], Teacher.train
+    monkeypatch.setattr(
+        Teacher, "train", lambda self, *given: lengths.append(self.plant.episode_steps) or learn(self, *given)
+    )
+    start = replace(START, gradient_steps=150, episode_steps=80, log_above=0.1)
+    config = replace(config, pretraining=start)
+    assert config.identification_steps == 8 * 80 + identify.LEVELS * 50
+    trainer, params = build(config)
+    policy = trainer.policy_params(trainer.start(0, params))
+    assert lengths == [50, 80, 80]
+    plant, of_plant = lag.make()
+    episodes = training_episodes(plant, of_plant, jax.random.key(1))
+    assert score(trainer.policy, policy, episodes) > 0.9 * score(*identify.static(plant, of_plant, KEY), episodes)
+
+
+def test_costs_count_by_their_logarithm_where_asked(config):
+    """The reward with which a step on one episode begins."""
+    trainer, _ = build(config)
+    model = counterfactual.fit(identify.record(*lag.make(), KEY, 8), 4)
+    of_record, prior = counterfactual.plant(trainer.env.plant, 4), identify.static(*lag.make(), KEY)[1]
+    actors = jax.tree.map(lambda leaf: leaf[None], trainer.learner.init(KEY).actor)
+    white = Whitening(np.zeros(trainer.env.observer.size), np.eye(trainer.env.observer.size))
+
+    def cost(log_above):
+        school = Teacher(of_record, trainer.policy, 1, log_above=log_above)
+        return -float(
+            school.train((actors, jax.vmap(ADAM.init)(actors)), white, prior, model, np.zeros(1), KEY)[1][0, 0]
+        )
+
+    assert cost(0.1) == pytest.approx(0.1 * np.log1p(cost(0.0) / 0.1), rel=1e-4)
 
 
 def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
@@ -113,13 +147,17 @@ def test_the_actor_waits_until_the_critic_has_learned():
 
 
 def test_a_model_longer_than_half_an_episode_is_refused(config):
-    with pytest.raises(ValueError, match=r"pretraining.lags is 26; it must be at most half an episode of lag, 25"):
+    with pytest.raises(ValueError, match=r"pretraining.lags is 26; it must be at most half a recorded episode, 25"):
         build(replace(config, pretraining=replace(START, lags=26)))
+    build(replace(config, pretraining=replace(START, lags=26, episode_steps=52)))
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("gradient_steps", -1), ("episodes", 0), ("lags", 0), ("batch_size", 0), ("noise", -1.0), ("load", -1.0)],
+    [
+        *(("gradient_steps", -1), ("noise", -1.0), ("load", -1.0), ("log_above", -1.0)),
+        *(("episodes", 0), ("episode_steps", 0), ("lags", 0), ("batch_size", 0), ("plants", 0)),
+    ],
 )
 def test_what_is_not_allowed_is_named(field, value):
     with pytest.raises(ValueError, match=rf"pretraining.{field} is {value}"):

@@ -7,6 +7,7 @@ allow; what the learner lacks to it, it lacks by learning. It reads the plant's 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,12 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.cache import Tuned, cached
 from jaxouter.evaluation.rivals.tuning import Report
+from jaxouter.loop import counterfactual
 from jaxouter.loop.identify import LEVELS, static
 from jaxouter.loop.policy import AffineParams
-from jaxouter.plants import Plant
-from jaxouter.training.config import TrainConfig, preset
+from jaxouter.plants import Plant, make
+from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import ADAM, Teacher, cosine, folded
 from jaxouter.training.trainer import build as build_trainer
@@ -32,6 +34,7 @@ FIRST_STAGE = 1000  # gradient steps; each stage then doubles their number
 STAGES = 3
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
+DRAWN = 2048  # plants that are simulated beforehand
 VALIDATION = 512  # training episodes on which the best seed is chosen
 
 
@@ -47,24 +50,42 @@ def returns(school: Teacher, actors: Any, prior: AffineParams, plant_params: Any
     return jax.lax.map(mean, actors)
 
 
-def teacher(config: TrainConfig) -> tuple[Teacher, Any]:
-    """The teacher with actor, randomisation and disturbances of a configuration, and the parameters of its plant."""
+def teacher(config: TrainConfig, key: chex.PRNGKey) -> tuple[Teacher, Any]:
+    """The teacher with actor, randomisation and disturbances of a configuration, and the parameters of its plant.
+
+    Drawn plants that respond alike at all times are simulated beforehand.
+    """
     trainer, env = build_trainer(config)
-    start = config.pretraining
-    return Teacher(trainer.env.plant, trainer.policy, BATCH, start.noise, start.load), env.plant
+    start, plant = config.pretraining, trainer.env.plant
+    plant = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
+    school = Teacher.of(start, plant, trainer.policy, BATCH)
+    if plant.draw is None:
+        return school, env.plant
+    try:
+        known = counterfactual.simulated(plant, env.plant, key, DRAWN)
+    except ValueError:
+        return school, env.plant
+    return replace(school, plant=counterfactual.plant(plant, plant.episode_steps)), known
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
-    del budget
-    return train(teacher(preset(plant.name))[0], params, key, report)
+    """`train` with the plant's `default` preset; `budget` is no bound: it may take what it needs."""
+    del params, budget
+    return train(preset(plant.name), key, report)
 
 
-def train(school: Teacher, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
+def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
+    """`train` on the drawn plants of a configuration, from the cache where it was made before."""
+    key = {"config": to_dict(replace(config, seed=0, seeds=1, devices=1))}
+    return cached(f"{config.plant}-oracle-{config.preset}", key, lambda: train(config, jax.random.key(0), report))
+
+
+def train(config: TrainConfig, key: chex.PRNGKey, report: Report) -> Tuned:
     """Train three seeds in stages that double what there is, until one gains less than 1 %; the best seed."""
+    key_static, key_white, key_seeds, key_run, key_test, key_draw = jax.random.split(key, 6)
+    school, params = teacher(config, key_draw)
     plant = school.plant
-    key_static, key_white, key_seeds, key_run, key_test = jax.random.split(key, 5)
-    _, prior = static(plant, params, key_static)
+    _, prior = static(*make(config.plant), key_static)
     white = school.whitening(prior, params, key_white)
     actors = jax.vmap(lambda key: school.policy.learner.init(key).actor)(jax.random.split(key_seeds, SEEDS))
     fold = jax.jit(jax.vmap(folded, (0, None)))
@@ -106,4 +127,4 @@ def learned(tuned: Tuned) -> LearnedParams:
 
 def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
     """The policy from what `tune` found."""
-    return teacher(preset(plant.name))[0].policy, learned(tuned)
+    return build_trainer(preset(plant.name))[0].policy, learned(tuned)

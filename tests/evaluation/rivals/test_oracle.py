@@ -35,7 +35,7 @@ def tuned():
 
 @pytest.fixture(scope="module")
 def school():
-    return oracle.teacher(preset("lag"))[0]
+    return oracle.teacher(preset("lag"), KEY)[0]
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_built_policy_is_the_one_that_was_chosen(tuned, school):
     """Its return on the validation episodes is the one written down."""
     policy, params = oracle.build(lag.LAG, tuned)
     assert policy == school.policy
-    key = jax.random.split(KEY, 5)[4]
+    key = jax.random.split(KEY, 6)[4]
     one = jax.tree.map(lambda leaf: leaf[None], params.actor)
     value = oracle.returns(school, one, params.prior, lag.make()[1], key)
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)

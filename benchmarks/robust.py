@@ -1,0 +1,100 @@
+"""What a policy trained on many plants holds, beside the rivals, tuned on the nominal one, and beside its own limit.
+
+Each plant starts 64 times as in training and is then asked for the scenario's set-point, for 600 steps. It is held
+where |y| stays within its limit in all of the last 300. The limit is the oracle, retrained on the same drawn plants.
+
+    python benchmarks/robust.py runs/pitch-robust-0      # results/robust-pitch.json, and two tables
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from datetime import date
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import tyro
+from comparison import show
+
+from jaxouter import cli
+from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.evaluate import Named, rival
+from jaxouter.evaluation.metrics import held, mae
+from jaxouter.evaluation.rivals import RIVALS, oracle
+from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.training.run import Run, surroundings, write_json
+
+RESULTS = Path(__file__).parent / "results"
+LEARNED, LIMIT = "learned", "its limit"
+
+
+def contenders(run: Run) -> Iterator[tuple[str, list[Named]]]:
+    """Name and policies: one for each seed of the run, and one of all others."""
+    trainer, _ = run.trainer
+    states = [run.load(seed)[0] for seed in run.seeds]
+    yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
+    limit = oracle.retrained(run.config, lambda text: print(f"{LIMIT}: {text}", flush=True))
+    yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
+    for name in RIVALS:
+        yield name, [rival(name, run.config.plant)]
+
+
+def met(policies: Sequence[Named], scenario: Scenario) -> dict[str, Any]:
+    """MAE and the share that is held, each the median over the seeds, with the worst seed."""
+    traces = [rollout(named.policy, named.params, scenario) for named in policies]
+    with np.errstate(all="ignore"):
+        maes, shares = [mae(t) for t in traces], [held(t, scenario.plant) for t in traces]
+    finite = [value if np.isfinite(value) else None for value in (median(maes), max(maes))]
+    return {"mae": finite[0], "worst_mae": finite[1], "held": median(shares), "worst_held": min(shares)}
+
+
+def cell(row: dict[str, Any], limit: dict[str, Any]) -> str:
+    """MAE, its ratio to the limit, and the share that is held."""
+    if row["mae"] is None:
+        return "diverged"
+    ratio = "" if limit["mae"] is None or row is limit else f" ({row['mae'] / limit['mae']:.2f})"
+    return f"{row['mae']:.3g}{ratio}, {100 * row['held']:.0f} %"
+
+
+def main(run: tyro.conf.Positional[Path]) -> None:
+    """The command."""
+    cli.use_compilation_cache()
+    opened = Run.open(run)
+    plant = opened.config.plant
+    plants = [scenarios.perturbed(name) for name in scenarios.stability_scenarios(plant)]
+    families = [scenario for name in scenarios.catalogue(plant) if (scenario := scenarios.get(name)).stable_alone]
+    content: dict[str, Any] = {"date": date.today().isoformat(), "machine": surroundings()}
+    content |= {"run": opened.config.preset, "seeds": list(opened.seeds), "ranges": opened.config.randomise}
+    content["places"] = {s.id: scenarios.place(s, *opened.drawn) for s in (*plants, *families)}
+    content |= {"perturbed": {}, "scenarios": {}}
+    for name, policies in contenders(opened):
+        print(name, flush=True)
+        content["perturbed"][name] = {scenario.id: met(policies, scenario) for scenario in plants}
+        if name in (LEARNED, LIMIT):
+            content["scenarios"][name] = {scenario.id: met(policies, scenario) for scenario in families}
+    write_json(RESULTS / f"robust-{plant}.json", content)
+    print(f"\n{plant}, {content['date']}: MAE (ratio to the limit), share held\n")
+    found = json.loads((RESULTS / f"robust-{plant}.json").read_text())
+    columns = list(found["perturbed"])
+    show(
+        ["plant", "among those of the training", *columns],
+        [
+            [s.id, found["places"][s.id]]
+            + [cell(found["perturbed"][name][s.id], found["perturbed"][LIMIT][s.id]) for name in columns]
+            for s in plants
+        ],
+    )
+    print("\nMAE on the scenarios whose inner loop is stable\n")
+    rows = []
+    for s in families:
+        ours, limit = (found["scenarios"][name][s.id]["mae"] for name in (LEARNED, LIMIT))
+        rows.append([s.id, found["places"][s.id], f"{ours:.3g}", f"{limit:.3g}", f"{ours / limit:.2f}"])
+    show(["scenario", "plant", LEARNED, LIMIT, "ratio"], rows)
+
+
+if __name__ == "__main__":
+    cli.run(lambda: tyro.cli(main))
