@@ -8,7 +8,6 @@ where |y| stays within its limit in all of the last 300. The limit is the oracle
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
@@ -66,34 +65,26 @@ def main(run: tyro.conf.Positional[Path]) -> None:
     opened = Run.open(run)
     plant = opened.config.plant
     plants = [scenarios.perturbed(name) for name in scenarios.stability_scenarios(plant)]
-    families = [scenario for name in scenarios.catalogue(plant) if (scenario := scenarios.get(name)).stable_alone]
-    content: dict[str, Any] = {"date": date.today().isoformat(), "machine": surroundings()}
-    content |= {"run": opened.config.preset, "seeds": list(opened.seeds), "ranges": opened.config.randomise}
-    content["places"] = {s.id: scenarios.place(s, *opened.drawn) for s in (*plants, *families)}
-    content |= {"perturbed": {}, "scenarios": {}}
+    stable = [scenario for name in scenarios.catalogue(plant) if (scenario := scenarios.get(name)).stable_alone]
+    places = {s.id: scenarios.place(s, *opened.drawn) for s in (*plants, *stable)}
+    started: dict[str, Any] = {}  # rows by policy and scenario
+    asked: dict[str, Any] = {}
     for name, policies in contenders(opened):
         print(name, flush=True)
-        content["perturbed"][name] = {scenario.id: met(policies, scenario) for scenario in plants}
+        started[name] = {scenario.id: met(policies, scenario) for scenario in plants}
         if name in (LEARNED, LIMIT):
-            content["scenarios"][name] = {scenario.id: met(policies, scenario) for scenario in families}
-    write_json(RESULTS / f"robust-{plant}.json", content)
-    print(f"\n{plant}, {content['date']}: MAE (ratio to the limit), share held\n")
-    found = json.loads((RESULTS / f"robust-{plant}.json").read_text())
-    columns = list(found["perturbed"])
-    show(
-        ["plant", "among those of the training", *columns],
-        [
-            [s.id, found["places"][s.id]]
-            + [cell(found["perturbed"][name][s.id], found["perturbed"][LIMIT][s.id]) for name in columns]
-            for s in plants
-        ],
-    )
+            asked[name] = {scenario.id: met(policies, scenario) for scenario in stable}
+    about = {"date": date.today().isoformat(), "machine": surroundings(), "seeds": list(opened.seeds)}
+    about |= {"preset": opened.config.preset, "ranges": opened.config.randomise, "places": places}
+    write_json(RESULTS / f"robust-{plant}.json", about | {"perturbed": started, "scenarios": asked})
+
+    print(f"\n{plant}, {about['date']}: MAE (ratio to its limit), share held\n")
+    rows = [[s.id, places[s.id], *(cell(row[s.id], started[LIMIT][s.id]) for row in started.values())] for s in plants]
+    show(["plant", "of the drawn ones", *started], rows)
     print("\nMAE on the scenarios whose inner loop is stable\n")
-    rows = []
-    for s in families:
-        ours, limit = (found["scenarios"][name][s.id]["mae"] for name in (LEARNED, LIMIT))
-        rows.append([s.id, found["places"][s.id], f"{ours:.3g}", f"{limit:.3g}", f"{ours / limit:.2f}"])
-    show(["scenario", "plant", LEARNED, LIMIT, "ratio"], rows)
+    pairs = [(s.id, [asked[name][s.id]["mae"] for name in (LEARNED, LIMIT)]) for s in stable]
+    rows = [[name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs]
+    show(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows)
 
 
 if __name__ == "__main__":

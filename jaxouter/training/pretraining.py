@@ -9,7 +9,7 @@ little, and the small differences are what tells the state of the plant.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -178,9 +178,6 @@ def pretrain(
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
-    Gradients through a loop that has become unstable lead nowhere. Where that happened, training goes on, with other
-    episodes, from where it was two reports before.
-
     Args:
         config: how many of both.
         plant, plant_params: only recorded from, through r~ and y.
@@ -188,27 +185,51 @@ def pretrain(
         key: random numbers.
         report: called with the gradient steps done (progress).
     """
-    key_record, key_white, key_run = jax.random.split(key, 3)
-    prior, natural = learned.prior, plant.episode_steps
-    plant = replace(plant, episode_steps=config.episode_steps or natural)
+    key_record, *keys = jax.random.split(key, 3)
     lags = config.lags or policy.observer.history
+    longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
     for key_plant in jax.random.split(key_record, config.plants):
         one = plant_params if plant.draw is None else plant.draw(jax.random.fold_in(key_plant, 1), plant_params)
-        data = identify.record(plant, one, key_plant, config.episodes // config.plants)
+        data = identify.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    school = Teacher.of(config, counterfactual.plant(plant, lags), policy, config.batch_size)
-    # What is unstable shows late: whole episodes follow, where they are longer than the plant's, when those can be won.
-    short = replace(school, plant=replace(school.plant, episode_steps=min(natural, plant.episode_steps)))
-    longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK if plant.episode_steps > natural else 0
-    white = short.whitening(prior, model, key_white)
+    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report)
+
+
+def rehearse(
+    config: PretrainingConfig,
+    plant: Plant,
+    plant_params: Any,
+    policy: LearnedPolicy,
+    learned: LearnedParams,
+    keys: Sequence[chex.PRNGKey],
+    report: Callable[[int], None] = lambda done: None,
+) -> Any:
+    """The actor after so many gradient steps on a differentiable plant, of which each episode is a draw.
+
+    What is unstable shows late, but can be won only by who holds the rest: where the configuration has episodes longer
+    than the plant's, they come last. Gradients through a loop that has become unstable lead nowhere: where that
+    happened, training goes on, with other episodes, from where it was two reports before.
+
+    Args:
+        config, policy, learned, report: as of `pretrain`.
+        plant, plant_params: with the plant's own length of an episode.
+        keys: two, of the whitening and of the episodes.
+    """
+    key_white, key_run = keys
+    prior, schools = learned.prior, [Teacher.of(config, plant, policy, config.batch_size)]
+    longer = config.gradient_steps  # from this step on
+    if (config.episode_steps or 0) > plant.episode_steps:
+        longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
+        schools.append(replace(schools[0], plant=replace(plant, episode_steps=config.episode_steps)))
+    white = schools[0].whitening(prior, plant_params, key_white)
     actors = jax.tree.map(lambda leaf: leaf[None], learned.actor)
     carry = actors, jax.vmap(ADAM.init)(actors)
     rates, best, trail = cosine(config.gradient_steps), -np.inf, [carry]
     for begin in range(0, config.gradient_steps, CHUNK):
-        chunk, now = rates[begin : begin + CHUNK], short if begin < longer else school
-        carry, reward = now.train(carry, white, prior, model, chunk, jax.random.fold_in(key_run, begin))
+        chunk, school = rates[begin : begin + CHUNK], schools[begin >= longer]
+        carry, reward = school.train(carry, white, prior, plant_params, chunk, jax.random.fold_in(key_run, begin))
         reward = np.asarray(reward)[:, 0]
         best, reached = reward[0] if begin == longer else max(best, reward[0]), reward[-LAST:].mean()
         if reached > COLLAPSED * best:  # both negative

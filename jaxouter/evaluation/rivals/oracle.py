@@ -25,7 +25,7 @@ from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant, make
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import ADAM, Teacher, cosine, folded
+from jaxouter.training.pretraining import ADAM, Teacher, cosine, folded, rehearse
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
@@ -50,42 +50,49 @@ def returns(school: Teacher, actors: Any, prior: AffineParams, plant_params: Any
     return jax.lax.map(mean, actors)
 
 
-def teacher(config: TrainConfig, key: chex.PRNGKey) -> tuple[Teacher, Any]:
-    """The teacher with actor, randomisation and disturbances of a configuration, and the parameters of its plant.
-
-    Drawn plants that respond alike at all times are simulated beforehand.
-    """
+def teacher(config: TrainConfig) -> tuple[Teacher, Any]:
+    """The teacher with actor and disturbances of a configuration, and the parameters of its plant."""
     trainer, env = build_trainer(config)
-    start, plant = config.pretraining, trainer.env.plant
-    plant = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
-    school = Teacher.of(start, plant, trainer.policy, BATCH)
-    if plant.draw is None:
-        return school, env.plant
-    try:
-        known = counterfactual.simulated(plant, env.plant, key, DRAWN)
-    except ValueError:
-        return school, env.plant
-    return replace(school, plant=counterfactual.plant(plant, plant.episode_steps)), known
-
-
-def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    """`train` with the plant's `default` preset; `budget` is no bound: it may take what it needs."""
-    del params, budget
-    return train(preset(plant.name), key, report)
+    return Teacher.of(config.pretraining, trainer.env.plant, trainer.policy, BATCH), env.plant
 
 
 def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
-    """`train` on the drawn plants of a configuration, from the cache where it was made before."""
+    """The limit of a configuration that draws plants: its own pretraining, but on these plants themselves.
+
+    Those that respond alike at all times are simulated beforehand. From the cache where it was made before.
+    """
+    start = config.pretraining
+
+    def make_it() -> Tuned:
+        trainer, params = build_trainer(config)
+        key_actor, key_static, key_drawn, *keys = jax.random.split(jax.random.key(0), 5)
+        plant, of_plant = trainer.env.plant, params.plant
+        learned = LearnedParams(trainer.learner.init(key_actor).actor, static(*make(config.plant), key_static)[1])
+        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
+        try:
+            of_plant = counterfactual.simulated(longer, of_plant, key_drawn, DRAWN)
+            plant = counterfactual.plant(plant, longer.episode_steps)
+        except ValueError:
+            pass  # stepped itself
+        actor = rehearse(start, plant, of_plant, trainer.policy, learned, keys, lambda n: report(f"gradient step {n}"))
+        steps = start.gradient_steps * start.batch_size * longer.episode_steps
+        return kept(actor, learned.prior, {"gradient_steps": start.gradient_steps}, steps)
+
     key = {"config": to_dict(replace(config, seed=0, seeds=1, devices=1))}
-    return cached(f"{config.plant}-oracle-{config.preset}", key, lambda: train(config, jax.random.key(0), report))
+    return cached(f"{config.plant}-oracle-{config.preset}", key, make_it)
 
 
-def train(config: TrainConfig, key: chex.PRNGKey, report: Report) -> Tuned:
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
+    del budget
+    return train(teacher(preset(plant.name))[0], params, key, report)
+
+
+def train(school: Teacher, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
     """Train three seeds in stages that double what there is, until one gains less than 1 %; the best seed."""
-    key_static, key_white, key_seeds, key_run, key_test, key_draw = jax.random.split(key, 6)
-    school, params = teacher(config, key_draw)
     plant = school.plant
-    _, prior = static(*make(config.plant), key_static)
+    key_static, key_white, key_seeds, key_run, key_test = jax.random.split(key, 5)
+    _, prior = static(plant, params, key_static)
     white = school.whitening(prior, params, key_white)
     actors = jax.vmap(lambda key: school.policy.learner.init(key).actor)(jax.random.split(key_seeds, SEEDS))
     fold = jax.jit(jax.vmap(folded, (0, None)))
@@ -107,19 +114,18 @@ def train(config: TrainConfig, key: chex.PRNGKey, report: Report) -> Tuned:
             best = jax.tree.map(lambda leaf: leaf[stages[-1].argmax()], fold(actors, white))
         if stage and so_far[-1] - max(so_far[:-1]) < ENOUGH * abs(so_far[-1]):
             break
-    arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(best).items()}
-    settings = {
-        "slope": float(prior.slope),
-        "offset": float(prior.offset),
-        "gradient_steps": gradient_steps,
-        "returns": [values.round(3).tolist() for values in stages],
-    }
-    steps = (SEEDS * gradient_steps * BATCH + LEVELS) * plant.episode_steps
-    return Tuned(settings, arrays, steps)
+    settings = {"gradient_steps": gradient_steps, "returns": [values.round(3).tolist() for values in stages]}
+    return kept(best, prior, settings, (SEEDS * gradient_steps * BATCH + LEVELS) * plant.episode_steps)
+
+
+def kept(actor: Any, prior: AffineParams, settings: dict[str, Any], steps: int) -> Tuned:
+    """What was found, as it is kept."""
+    arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(actor).items()}
+    return Tuned({"slope": float(prior.slope), "offset": float(prior.offset)} | settings, arrays, steps)
 
 
 def learned(tuned: Tuned) -> LearnedParams:
-    """The policy's parameters from what `train` found."""
+    """The policy's parameters from what was found."""
     actor = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
     prior = AffineParams(*(jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset")))
     return LearnedParams(actor, prior)

@@ -9,10 +9,12 @@ from jaxouter import plants
 from jaxouter.evaluation.rivals import mpc, oracle, pi
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import identify
-from jaxouter.training.config import preset
+from jaxouter.training.config import PretrainingConfig, preset
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import Whitening, folded
+from jaxouter.training.trainer import build
 from tests import lag
+from tests.training.small import small as small_run
 
 KEY = jax.random.key(0)
 SMALL = {"SEEDS": 1, "BATCH": 16, "FIRST_STAGE": 150, "STAGES": 2, "VALIDATION": 64}
@@ -35,7 +37,7 @@ def tuned():
 
 @pytest.fixture(scope="module")
 def school():
-    return oracle.teacher(preset("lag"), KEY)[0]
+    return oracle.teacher(preset("lag"))[0]
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +74,24 @@ def test_built_policy_is_the_one_that_was_chosen(tuned, school):
     """Its return on the validation episodes is the one written down."""
     policy, params = oracle.build(lag.LAG, tuned)
     assert policy == school.policy
-    key = jax.random.split(KEY, 6)[4]
+    key = jax.random.split(KEY, 5)[4]
     one = jax.tree.map(lambda leaf: leaf[None], params.actor)
     value = oracle.returns(school, one, params.prior, lag.make()[1], key)
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
+
+
+def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_made_once():
+    start = PretrainingConfig(gradient_steps=100, batch_size=16)
+    config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), residual=True, steps=0)
+    said = []
+    found = oracle.retrained(config, said.append)
+    assert said == ["gradient step 50", "gradient step 100"]
+    trainer, params = build(config)
+    episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
+    alone = score(*identify.static(*lag.make(), KEY), episodes)
+    assert score(trainer.policy, oracle.learned(found), episodes) > 0.85 * alone  # both negative
+    again = oracle.retrained(config, said.append)
+    assert (again.seconds, len(said)) == (found.seconds, 2)
 
 
 def test_folded_acts_like_the_network_on_whitened_observations(school):
