@@ -31,10 +31,10 @@ RESULTS = Path(__file__).parent / "results"
 LEARNED, LIMIT = "learned", "its limit"
 
 
-def contenders(run: Run) -> Iterator[tuple[str, list[Named]]]:
-    """Name and policies: one for each seed of the run, and one of all others."""
-    trainer, _ = run.trainer
-    states = [run.load(seed)[0] for seed in run.seeds]
+def contenders(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
+    """Name and policies: one for each seed of the runs, and one of all others."""
+    run, (trainer, _) = runs[0], runs[0].trainer
+    states = [one.load(seed)[0] for one in runs for seed in one.seeds]
     yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
     limit = oracle.retrained(run.config, lambda text: print(f"{LIMIT}: {text}", flush=True))
     yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
@@ -59,14 +59,14 @@ def cell(row: dict[str, Any], limit: dict[str, Any]) -> str:
     return f"{row['mae']:.3g}{ratio}, {100 * row['held']:.0f} %"
 
 
-def main(run: tyro.conf.Positional[Path]) -> None:
-    """The command."""
+def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
+    """The command; several runs differ by their seeds."""
     cli.use_compilation_cache()
-    opened = Run.open(run)
-    plant = opened.config.plant
+    opened = [Run.open(path) for path in runs]
+    config, plant = opened[0].config, opened[0].config.plant
     plants = [scenarios.perturbed(name) for name in scenarios.stability_scenarios(plant)]
     catalogue = [scenarios.get(name) for name in scenarios.catalogue(plant)]
-    places = {s.id: scenarios.place(s, *opened.drawn) for s in catalogue}
+    places = {s.id: scenarios.place(s, *opened[0].drawn) for s in catalogue}
     started: dict[str, Any] = {}  # rows by policy and scenario
     asked: dict[str, Any] = {}
     for name, policies in contenders(opened):
@@ -74,8 +74,12 @@ def main(run: tyro.conf.Positional[Path]) -> None:
         started[name] = {scenario.id: met(policies, scenario) for scenario in plants}
         if name in (LEARNED, LIMIT):
             asked[name] = {scenario.id: met(policies, scenario) for scenario in catalogue}
-    about = {"date": date.today().isoformat(), "machine": surroundings(), "seeds": list(opened.seeds)}
-    about |= {"preset": opened.config.preset, "ranges": opened.config.randomise, "places": places}
+    about = {
+        "date": date.today().isoformat(),
+        "machine": surroundings(),
+        "seeds": [seed for run in opened for seed in run.seeds],
+    }
+    about |= {"preset": config.preset, "ranges": config.randomise, "places": places}
     write_json(RESULTS / f"robust-{plant}.json", about | {"perturbed": started, "scenarios": asked})
 
     print(f"\n{plant}, {about['date']}: MAE (ratio to its limit), share held\n")
