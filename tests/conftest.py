@@ -12,8 +12,6 @@ import pytest
 # Tests share compiled functions with each other and with the commands that they start, not with the user's own cache.
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
-# Most of the suite's time is compilation, a third of it LLVM's optimisation of code that runs for a moment.
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
