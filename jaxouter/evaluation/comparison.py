@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter
 
-from jaxouter.evaluation.figures import LIMIT, REFERENCE, save, symbol, times
+from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, symbol, times
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario, paper_scenarios
@@ -84,19 +83,6 @@ def _short(scenario: str) -> str:
     return scenario.split("/", 1)[-1]
 
 
-def _log(axes: Axes, which: str) -> None:
-    """Log axis with plain numbers, as many as there is room for."""
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    low, high = axis.get_view_interval()
-    decades = np.log10(high / low)
-    subs = (1.0, 2.0, 5.0) if decades < 2.5 else (1.0, 3.0) if decades < 4 else (1.0,)
-    subs = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.9 else subs
-    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
-
-
 def _legend(figure: Figure, shown: Mapping[str, Style], lines_too: bool = True, **kwargs: Any) -> None:
     """One legend for the whole figure, below it."""
     handles = [
@@ -123,7 +109,7 @@ def errors(path: Path, comparison: Mapping[str, Any]) -> Path:
         axes.axhspan(i - 0.5, i + 0.5, color="#f3f3f3" if i % 2 == 0 else "#ffffff", lw=0, zorder=0)
         for offset, line in zip(offsets, every, strict=True):
             _dot(axes, line, look[line.label], name, key, i + offset)
-    _log(axes, "x")
+    log_axis(axes, "x")
     if limited:
         axes.axvline(1.0, color="#111111", ls=DASHED, lw=1.2, zorder=2)
     axes.set_yticks(range(len(names)), [_short(name) for name in names])
@@ -182,8 +168,8 @@ def effort(path: Path, comparison: Mapping[str, Any]) -> Path:
             style, size = look[line.label], 9 if line.kind == "learned" else 6.5
             axes.plot(x, y, marker=style.marker, color=style.color, ms=size, ls="", zorder=style.zorder)
         axes.margins(0.16)
-        _log(axes, "x")
-        _log(axes, "y")
+        log_axis(axes, "x")
+        log_axis(axes, "y")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_xlabel(f"MAE [{unit}]" + "\ndiverged: " * bool(missing) + ", ".join(map(_plain, missing)))
         axes.set_ylabel(f"variation of r̃ an episode [{unit}]")
@@ -316,9 +302,9 @@ def _curves(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
             "nominal", (axis["nominal"], 0.97), xycoords=("data", "axes fraction"), xytext=(3, 0),
             textcoords="offset points", fontsize=7.5, color="#555555",
         )  # fmt: skip
-        _log(axes, "y")
+        log_axis(axes, "y")
         if min(axis["values"]) > 0 and max(axis["values"]) > 100 * min(axis["values"]):
-            _log(axes, "x")
+            log_axis(axes, "x")
         axes.set_xlabel(_axis_label(axis))
         axes.set_ylabel("MAE ratio")
         axes.set_title(f"MAE {title}", fontsize=10, loc="left", pad=6 + 8 * lost)

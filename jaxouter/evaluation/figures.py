@@ -33,6 +33,19 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def log_axis(axes: Axes, which: str) -> None:
+    """Log axis with plain numbers, as many as there is room for."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    subs = (1.0, 2.0, 5.0) if decades < 2.5 else (1.0, 3.0) if decades < 4 else (1.0,)
+    subs = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.9 else subs
+    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
 def symbol(unit: str) -> str:
     """A unit as it is written in a figure."""
     return UNITS.get(unit, unit)
@@ -200,10 +213,7 @@ def learning_curve(
     for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
         left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
     left.set_ylabel("MAE without exploration")
-    left.set_yscale("log")
-    left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    left.yaxis.set_major_formatter("{x:g}")
-    left.yaxis.set_minor_formatter(NullFormatter())
+    log_axis(left, "y")
     left.set_title(title, fontsize=10, loc="left")
     right.set_ylabel("reward a step, with exploration")
     for axes in (left, right):

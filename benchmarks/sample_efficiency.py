@@ -1,0 +1,153 @@
+"""How many control steps of the plant it takes to beat the static prefilter, and to come within 10 % of the limit.
+
+    python benchmarks/sample_efficiency.py              # train what is not there yet; two hours
+    python benchmarks/sample_efficiency.py heaters      # one plant
+
+`paper` learns as it goes: a point of its curve is an evaluation after an epoch, its runs are cut where the curve has
+long been flat (nothing in the preset depends on the length). `default` records first: a point is a run of its own that
+recorded so many episodes. Both count all steps of the plant, those of identification included. The MAE is that of the
+first of the paper's scenarios, on which nothing is trained. Table, curve and numbers go to results/.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tyro
+from comparison import show
+from matplotlib.figure import Figure
+
+from jaxouter import cli
+from jaxouter.evaluation import figures, scenarios
+from jaxouter.evaluation.evaluate import evaluate, rival
+from jaxouter.evaluation.statistics import interval
+from jaxouter.training.run import Run, surroundings, write_json
+
+RESULTS = Path(__file__).parent / "results"
+SEEDS = 10
+STEPS = {"pitch": 120_000, "heaters": 60_000}  # of the preset `paper`
+EPISODES = (1, 4, 16, 64)  # of the preset `default`
+NEAR = 1.1  # times the limit
+
+
+class Curve(NamedTuple):
+    """MAE of each seed after so many control steps."""
+
+    steps: np.ndarray  # (points,)
+    mae: np.ndarray  # (points, seeds)
+
+    def median(self) -> np.ndarray:
+        """Over the seeds (points,)."""
+        return np.median(self.mae, -1)
+
+    def interval(self) -> np.ndarray:
+        """95 % bootstrap interval of the median (points, 2)."""
+        return np.array([interval(lambda x: np.median(x, axis=-1), [of_seeds]) for of_seeds in self.mae])
+
+    def first(self, level: float) -> list[int | None]:
+        """Steps after which each seed is below the level for the first time; None where it never is."""
+        below = self.mae < level
+        return [int(self.steps[seed.argmax()]) if seed.any() else None for seed in below.T]
+
+    def half_below(self, level: float) -> int | None:
+        """Steps from which on the median over the seeds stays below the level."""
+        above = np.flatnonzero(self.median() >= level)
+        since = above[-1] + 1 if len(above) else 0
+        return int(self.steps[since]) if since < len(self.steps) else None
+
+
+def trained(folder: Path, *arguments: str) -> Run:
+    """The run in a folder, trained unless it is there."""
+    if not (folder / "summary.json").exists():
+        start = [*arguments, "--seeds", str(SEEDS), "--out", str(folder)]
+        command = ["-m", "jaxouter.train", *(["--resume", str(folder)] if folder.exists() else start)]
+        print(f"python {' '.join(command)}", flush=True)
+        subprocess.run([sys.executable, *command], check=True)
+    return Run.open(folder)
+
+
+def curves(plant: str, runs: Path) -> dict[str, Curve]:
+    """The curve of each preset."""
+    paper = trained(runs / f"{plant}-paper", plant, "--preset", "paper", "--steps", str(STEPS[plant]))
+    rows = np.array([[(row["steps"], row["mae"]) for row in paper.rows(seed)] for seed in paper.seeds])
+    steps, maes = [], []
+    for episodes in EPISODES:
+        run = trained(runs / f"{plant}-default-{episodes}", plant, "--pretraining.episodes", str(episodes))
+        steps.append(run.config.environment_steps)
+        maes.append([run.rows(seed)[0]["mae"] for seed in run.seeds])
+    return {
+        "paper": Curve(rows[0, :, 0] + paper.config.identification_steps, rows[:, :, 1].T),
+        "default": Curve(np.array(steps), np.array(maes)),
+    }
+
+
+def draw(path: Path, found: dict[str, Curve], levels: dict[str, float], title: str, unit: str) -> None:
+    """MAE against control steps, with the interval of the median and the range of the seeds."""
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for (name, curve), color in zip(found.items(), (figures.MODIFIED, figures.LEARNED), strict=True):
+        low, high = curve.interval().T
+        marker = "o" if name == "default" else None
+        axes.plot(
+            curve.steps, curve.median(), color=color, lw=1.8, marker=marker, label=f"{name}, median of {SEEDS} seeds"
+        )
+        axes.fill_between(curve.steps, low, high, color=color, alpha=0.3, lw=0, label="95 % interval of the median")
+        axes.fill_between(
+            curve.steps, curve.mae.min(1), curve.mae.max(1), color=color, alpha=0.1, lw=0, label="all seeds"
+        )
+    for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=True):
+        axes.axhline(value, color=figures.INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
+    axes.set_xscale("log")
+    figures.log_axis(axes, "y")
+    axes.set_xlabel("control steps of the plant")
+    axes.set_ylabel(f"MAE [{unit}]")
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.legend(fontsize=7.5, framealpha=0.85)
+    figures.save(figure, path)
+
+
+def spread(steps: Sequence[int | None], none: str = "never") -> str:
+    """Median of the seeds, least and greatest."""
+    ordered = sorted(steps, key=lambda s: np.inf if s is None else s)
+    low, middle, high = (none if s is None else f"{s:,}" for s in (ordered[0], ordered[len(ordered) // 2], ordered[-1]))
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def main(
+    plants: tyro.conf.Positional[tuple[str, ...]] = tuple(STEPS), runs: Path = Path("runs/sample-efficiency")
+) -> None:
+    """The command."""
+    cli.use_compilation_cache()
+    table = []
+    for plant in plants:
+        scenario = scenarios.get(scenarios.paper_scenarios(plant)[0])
+        found = curves(plant, runs)
+        static, limit = (
+            evaluate(rival(name, plant), [scenario])[scenario.id][1]["mae"] for name in ("static", "oracle")
+        )
+        levels = {"static": static, f"{NEAR:g} x the limit": NEAR * limit, "limit": limit}
+        rows: dict[str, Any] = {}
+        for name, curve in found.items():
+            to = {key: curve.first(level) for key, level in (("static", static), ("limit", NEAR * limit))}
+            stays = {key: curve.half_below(level) for key, level in (("static", static), ("limit", NEAR * limit))}
+            rows[name] = {"steps": curve.steps.tolist(), "mae": curve.mae.tolist(), "first": to, "median_stays": stays}
+            cells = [f"{spread(to[key])}; {spread([stays[key]])}" for key in to]
+            table.append([scenario.id, name, *cells, f"{curve.median()[-1]:.3g} at {curve.steps[-1]:,.0f}"])
+        about = {"date": date.today().isoformat(), "machine": surroundings(), "seeds": SEEDS, "scenario": scenario.id}
+        write_json(RESULTS / f"sample-efficiency-{plant}.json", about | {"levels": levels, "presets": rows})
+        title = f"{scenario.id}: MAE against control steps"
+        draw(RESULTS / f"sample-efficiency-{plant}.png", found, levels, title, figures.symbol(scenario.plant.y_unit))
+    print("\nControl steps, median (least to greatest) of the seeds; and from which on the median stays there\n")
+    show(
+        ["scenario", "preset", "to beat static", f"to come within {NEAR - 1:.0%} of the limit", "MAE in the end"], table
+    )
+
+
+if __name__ == "__main__":
+    cli.run(lambda: tyro.cli(main, description=__doc__))
