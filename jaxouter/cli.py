@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
@@ -19,6 +20,7 @@ from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.training.config import PRESETS, TrainConfig
+from jaxouter.training.run import DamagedWarning
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
 LINE_SECONDS = 5.0  # between two plain lines of progress
@@ -26,9 +28,12 @@ LINE_SECONDS = 5.0  # between two plain lines of progress
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """A ValueError in here is the user's mistake: one message, exit status 2."""
+    """A ValueError in here is the user's mistake: one message, exit status 2; a warning is one line."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", DamagedWarning)
+            warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+            yield
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -74,7 +79,7 @@ class Interrupt:
     def _handle(self, number: int, frame: Any) -> None:
         del frame
         self.requested = True
-        print("\nstopping: the epoch ends, then everything is saved", file=sys.stderr)
+        print("\nstopping: the epoch of all seeds ends, then everything is saved; once more: at once", file=sys.stderr)
         signal.signal(number, self._before[number])
 
     def __exit__(

@@ -7,6 +7,7 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -90,29 +91,45 @@ def main(arguments: list[str] | None = None) -> None:
         Fleet.of(config)  # what is left of the checks, before anything is written
         path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
         run = Run(Path(path), config)
-        first, trainer = devices.is_first(), run.trainer[0]
-        if first:
-            seeds = ", ".join(map(str, run.seeds))
-            print(f"{config.plant}, preset {config.preset}, seeds {seeds} -> {run.path}")
-            for name, low, high in config.randomise:
-                print(f"each plant has its own {name}, from {low:g} to {high:g}")
-        with cli.Interrupt() as interrupt:
-            watched = scenarios.get(scenarios.paper_scenarios(run.config.plant)[0])
-
-            def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
-                # With the single outputs only because the report asks for them too, in the same compiled function.
-                traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
-                return {"mae": mae(traces)}
-
-            with cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
-                finals = train(run, watch, progress, lambda: interrupt.requested, progress.pretrained)
-        devices.part()
+        with ExitStack() as stack:
+            devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
+            try:
+                finals = learn(run, options.resume is not None)
+                if devices.is_first() and finals is not None:
+                    report(run, finals, begun)
+            except OSError as error:
+                raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
     if finals is None:
-        if first:
-            print(f"saved; go on with: python -m jaxouter.train --resume {run.path}", file=sys.stderr)
+        if devices.is_first():
+            print(f"saved; {go_on(run)}", file=sys.stderr)
         raise SystemExit(130)
-    if first:
-        report(run, finals, begun)
+
+
+def go_on(run: Run) -> str:
+    """How to."""
+    return f"go on with: python -m jaxouter.train --resume {run.path}"
+
+
+def learn(run: Run, resumed: bool) -> dict[int, TrainState] | None:
+    """Train with progress, until the end or a signal."""
+    config, trainer = run.config, run.trainer[0]
+    if devices.is_first():
+        print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
+        for name, low, high in config.randomise:
+            print(f"each plant has its own {name}, from {low:g} to {high:g}")
+        for change in run.changes() if resumed else ():
+            print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
+    watched = scenarios.get(scenarios.paper_scenarios(config.plant)[0])
+
+    def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
+        # With the single outputs only because the report asks for them too, in the same compiled function.
+        traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
+        return {"mae": mae(traces)}
+
+    with cli.Interrupt() as interrupt, cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
+        finals = train(run, watch, progress, lambda: interrupt.requested, progress.pretrained)
+    devices.part()
+    return finals
 
 
 def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:

@@ -1,10 +1,13 @@
-"""Checkpoints: a pytree as named host arrays and a JSON header in one npz file, without pickle."""
+"""Checkpoints: a pytree as named host arrays and a JSON header in one npz file with a checksum, without pickle."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2  # 1 had no checksum
+MARK = b"jaxouter sha256:"  # before the digest of all that precedes it, at the end of the file
 Tree = TypeVar("Tree")
 
 
@@ -24,6 +28,29 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
+def write(path: Path, content: bytes | memoryview) -> None:
+    """Write a file, whole or not at all, also where the power fails: to a neighbour, which then takes its name.
+
+    Raises:
+        OSError: it can't be written; `path` is as it was.
+    """
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        partial.unlink(missing_ok=True)  # what a full disk needs first
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # of the name
+    finally:
+        os.close(folder)
+
+
 def save(path: Path, tree: Any, **header: Any) -> None:
     """Write `tree` to `path`, whole or not at all.
 
@@ -31,16 +58,17 @@ def save(path: Path, tree: Any, **header: Any) -> None:
         path: file, replaced where it exists.
         tree: pytree of arrays; PRNG keys are stored as their data.
         **header: JSON values kept with it.
+
+    Raises:
+        OSError: it can't be written; `path` is as it was.
     """
     arrays = {name: np.asarray(jax.random.key_data(x) if _is_key(x) else x) for name, x in _named(tree).items()}
     shapes = {name: [list(array.shape), str(array.dtype)] for name, array in arrays.items()}
     text = json.dumps({"format": FORMAT, "jax": jax.__version__, "arrays": shapes, **header})
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, header=np.asarray(text), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, header=np.asarray(text), **arrays)
+    buffer.write(MARK + hashlib.sha256(buffer.getbuffer()).digest())
+    write(path, buffer.getbuffer())
 
 
 def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
@@ -56,14 +84,7 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
     Raises:
         ValueError: the file is not readable, damaged, of another format or of another configuration.
     """
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            arrays = {name: file[name] for name in file.files if name != "header"}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path} has format {header.get('format')}; this version reads format {FORMAT}")
+    header, arrays = read(path)
     wanted = _named(like)
     if set(wanted) != set(arrays):
         raise ValueError(f"{path} belongs to another configuration: {sorted(set(wanted) ^ set(arrays))[0]} differs")
@@ -75,3 +96,30 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
             raise ValueError(f"{path}: {name} is {array.dtype}{array.shape}, expected {leaf.dtype}{leaf.shape}")
         leaves.append(array)
     return jax.tree.unflatten(jax.tree.structure(like), leaves), header
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays by name, the checksum compared.
+
+    Raises:
+        ValueError: the file is not readable, damaged or of another format.
+    """
+    try:
+        content = path.read_bytes()
+        body, mark, digest = content[: -len(MARK) - 32], content[-len(MARK) - 32 : -32], content[-32:]
+        summed = mark == MARK
+        if summed and hashlib.sha256(body).digest() != digest:
+            raise ValueError("its checksum differs: it is damaged")
+        with np.load(io.BytesIO(body if summed else content), allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            arrays = {name: file[name] for name in file.files if name != "header"}
+        if not isinstance(header, dict) or header.get("format") not in range(1, FORMAT + 1):
+            raise ValueError(f"it is not of format 1 to {FORMAT}, which this version reads")
+        if header["format"] > 1 and not summed:
+            raise ValueError("it has no checksum: it is not whole")
+    # Without a checksum to stop them, any bytes reach zipfile and NumPy, which answer with more than they document.
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
+    except (NotImplementedError, RuntimeError, AttributeError, TypeError, OverflowError, MemoryError) as error:
+        raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
+    return header, arrays

@@ -35,6 +35,22 @@ SHORT = 1 / 3  # of the gradient steps, with episodes no longer than the plant's
 FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 
 
+class Rehearsal(NamedTuple):
+    """The state of a rehearsal: all that its next gradient steps depend on."""
+
+    before: Any  # whitened actors and optimiser state, each leaf (1, ...), of one report before
+    now: Any  # the same, now
+    best: Any  # float32, mean reward
+    done: Any  # int32, gradient steps
+
+    @classmethod
+    def begin(cls, actor: Any) -> Rehearsal:
+        """Before the first step, from an actor whose first layer takes the whitened observation."""
+        actors = jax.tree.map(lambda leaf: leaf[None], actor)
+        carry = actors, jax.vmap(ADAM.init)(actors)
+        return cls(carry, carry, np.float32(-np.inf), np.int32(0))
+
+
 class Whitening(NamedTuple):
     """(obs - mean) @ matrix has nearly unit covariance."""
 
@@ -174,7 +190,8 @@ def pretrain(
     policy: LearnedPolicy,
     learned: LearnedParams,
     key: chex.PRNGKey,
-    report: Callable[[int], None] = lambda done: None,
+    report: Callable[[Rehearsal], None] = lambda at: None,
+    begin: Rehearsal | None = None,
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
@@ -183,7 +200,8 @@ def pretrain(
         plant, plant_params: only recorded from, through r~ and y.
         policy, learned: what to begin with; an actor whose first layer takes the whitened observation.
         key: random numbers.
-        report: called with the gradient steps done (progress).
+        report: called now and then with the rehearsal so far.
+        begin: where a rehearsal with the same arguments was stopped; None: at its beginning.
     """
     key_record, *keys = jax.random.split(key, 3)
     lags = config.lags or policy.observer.history
@@ -194,7 +212,7 @@ def pretrain(
         data = identify.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report)
+    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin)
 
 
 def rehearse(
@@ -204,7 +222,8 @@ def rehearse(
     policy: LearnedPolicy,
     learned: LearnedParams,
     keys: Sequence[chex.PRNGKey],
-    report: Callable[[int], None] = lambda done: None,
+    report: Callable[[Rehearsal], None] = lambda at: None,
+    begin: Rehearsal | None = None,
 ) -> Any:
     """The actor after so many gradient steps on a differentiable plant, of which each episode is a draw.
 
@@ -213,7 +232,7 @@ def rehearse(
     happened, training goes on, with other episodes, from where it was two reports before.
 
     Args:
-        config, policy, learned, report: as of `pretrain`.
+        config, policy, learned, report, begin: as of `pretrain`.
         plant, plant_params: with the plant's own length of an episode.
         keys: two, of the whitening and of the episodes.
     """
@@ -224,18 +243,16 @@ def rehearse(
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
         schools.append(replace(schools[0], plant=replace(plant, episode_steps=config.episode_steps)))
     white = schools[0].whitening(prior, plant_params, key_white)
-    actors = jax.tree.map(lambda leaf: leaf[None], learned.actor)
-    carry = actors, jax.vmap(ADAM.init)(actors)
-    rates, best, trail = cosine(config.gradient_steps), -np.inf, [carry]
-    for begin in range(0, config.gradient_steps, CHUNK):
-        chunk, school = rates[begin : begin + CHUNK], schools[begin >= longer]
-        carry, reward = school.train(carry, white, prior, plant_params, chunk, jax.random.fold_in(key_run, begin))
+    rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
+    while (done := int(at.done)) < config.gradient_steps:
+        chunk, school = rates[done : done + CHUNK], schools[done >= longer]
+        carry, reward = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
         reward = np.asarray(reward)[:, 0]
-        best, reached = reward[0] if begin == longer else max(best, reward[0]), reward[-LAST:].mean()
+        best, reached = reward[0] if done == longer else max(at.best, reward[0]), reward[-LAST:].mean()
+        then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative
-            best, trail = max(best, reached), [*trail[-1:], carry]
+            at = Rehearsal(at.now, carry, np.float32(max(best, reached)), then)
         else:
-            carry = trail[0]
-            trail = [carry]
-        report(begin + len(chunk))
-    return folded(jax.tree.map(lambda leaf: leaf[0], carry[0]), white)
+            at = Rehearsal(at.before, at.before, np.float32(best), then)
+        report(at)
+    return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)

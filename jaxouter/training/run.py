@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -19,10 +25,15 @@ from jaxouter.plants import Ranges
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
 from jaxouter.training.devices import Fleet
+from jaxouter.training.pretraining import Rehearsal
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 FORMAT = 1
 KEEP = 2  # checkpoints of each seed
+
+
+class DamagedWarning(UserWarning):
+    """A file of the run folder is damaged, and another is used in its place."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +55,25 @@ class Run:
             [out] if out is not None else [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))]
         )
         for path in candidates:
-            try:
-                path.mkdir(parents=True)
-            except FileExistsError:
+            if path.exists():
                 continue
+            made = None
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                made = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+                run = cls(made, config)
+                write_json(made / "config.json", {"format": FORMAT, "config": to_dict(config)} | surroundings())
+                for seed in run.seeds:
+                    run.seed_folder(seed).mkdir()
+                made.chmod(0o755)
+                made.rename(path)  # whole or not at all: it is a run from its first moment on
             except OSError as error:
+                if made is not None:
+                    shutil.rmtree(made, ignore_errors=True)
+                if path.exists():  # made by another process meanwhile
+                    continue
                 raise ValueError(f"the folder {path} can't be made: {error.strerror}") from None
-            run = cls(path, config)
-            write_json(path / "config.json", {"format": FORMAT, "config": to_dict(config)} | surroundings())
-            for seed in run.seeds:
-                run.seed_folder(seed).mkdir()
-            return run
+            return cls(path, config)
         raise ValueError(f"{candidates[0]} exists; choose another --out, or go on with it by --resume {candidates[0]}")
 
     @classmethod
@@ -74,6 +93,36 @@ class Run:
             return cls(path, from_dict(content["config"]))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"{path}/config.json is not a configuration: {error}") from None
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """The folder for this process alone to write, until the block or the process ends.
+
+        Raises:
+            ValueError: another process has it.
+        """
+        with (self.path / "lock").open("a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise ValueError(
+                    f"{self.path} is being trained by process {file.read().strip()}; wait for its end, or stop it"
+                ) from None
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
+            yield
+
+    def changes(self) -> list[str]:
+        """What the results depend on and is no longer what it was when the run was made."""
+        before, now = json.loads((self.path / "config.json").read_text()), surroundings()
+        pairs = [
+            (name, before.get(group, {}).get(name), value)
+            for group, values in now.items()
+            for name, value in values.items()
+        ]
+        return [f"{name} was {was} and is {value}" for name, was, value in pairs if was != value]
 
     @property
     def seeds(self) -> range:
@@ -109,28 +158,43 @@ class Run:
         paths = sorted(self.seed_folder(seed).glob("checkpoint-*.npz"))
         return {int(path.stem.removeprefix("checkpoint-")): path for path in paths}
 
+    def whole(self, seed: int) -> dict[int, Path]:
+        """The checkpoints of a seed that are not damaged; warns of each that is."""
+        found = self.checkpoints(seed)
+        for epoch, path in list(found.items()):
+            try:
+                checkpoint.read(path)
+            except ValueError as error:
+                warnings.warn(f"{error}; it is left out", DamagedWarning, stacklevel=2)
+                del found[epoch]
+        return found
+
     def common_epoch(self) -> int:
-        """The newest epoch of which every seed has a checkpoint, where all go on together; 0 at the beginning.
+        """The newest epoch of which every seed has a whole checkpoint, where all go on together; 0 at the beginning.
 
         Raises:
             ValueError: there is none, although some seed is further than the first epoch.
         """
-        kept = {seed: set(self.checkpoints(seed)) for seed in self.seeds}
+        kept = {seed: set(self.whole(seed)) for seed in self.seeds}
         common = set.intersection(*kept.values())
-        if not common and any(max(epochs, default=0) > 1 for epochs in kept.values()):
+        if not common and any(max(self.checkpoints(seed), default=0) > 1 for seed in self.seeds):
             found = "; ".join(f"seed {seed}: {sorted(epochs) or 'none'}" for seed, epochs in kept.items())
-            raise ValueError(f"{self.path}: the seeds have no checkpoint of the same epoch ({found})")
+            raise ValueError(f"{self.path}: the seeds have no whole checkpoint of the same epoch ({found})")
         return max(common, default=0)
 
     def save(self, seed: int, epoch: int, state: TrainState) -> None:
-        """Checkpoint after so many epochs; old ones are removed."""
+        """Checkpoint after so many epochs; old ones are removed.
+
+        Raises:
+            OSError: it can't be written; the old ones are there.
+        """
         path = self.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz"
         checkpoint.save(path, state, seed=seed, epoch=epoch)
-        for old in list(self.checkpoints(seed).values())[:-KEEP]:
-            old.unlink()
+        for old in [*list(self.checkpoints(seed).values())[:-KEEP], self._rehearsal(seed)]:
+            old.unlink(missing_ok=True)
 
     def load(self, seed: int, epoch: int | None = None) -> tuple[TrainState, int]:
-        """State and number of epochs of the checkpoint after so many epochs; None: the newest.
+        """State and number of epochs of the checkpoint after so many epochs; None: the newest that is whole.
 
         Raises:
             ValueError: there is none, or it is not readable.
@@ -138,10 +202,36 @@ class Run:
         paths = self.checkpoints(seed)
         if not paths:
             raise ValueError(f"{self.seed_folder(seed)} has no checkpoint yet")
+        if epoch is None:
+            epoch = max(self.whole(seed) or paths)
         trainer, params = self.trainer
         like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
-        state, header = checkpoint.load(paths[max(paths) if epoch is None else epoch], like)
+        state, header = checkpoint.load(paths[epoch], like)
         return state, header["epoch"]
+
+    def save_rehearsal(self, seed: int, at: Rehearsal) -> None:
+        """Keep how far the pretraining of a seed is, until there is a checkpoint.
+
+        Raises:
+            OSError: it can't be written; the one before is there.
+        """
+        checkpoint.save(self._rehearsal(seed), at, seed=seed)
+
+    def load_rehearsal(self, seed: int) -> Rehearsal | None:
+        """How far the pretraining of a seed is; None: at its beginning. Warns where what was kept is damaged."""
+        path = self._rehearsal(seed)
+        if not path.exists():
+            return None
+        trainer, _ = self.trainer
+        try:
+            actor = jax.eval_shape(trainer.learner.init, jax.random.key(0)).actor
+            return checkpoint.load(path, jax.eval_shape(Rehearsal.begin, actor))[0]
+        except ValueError as error:
+            warnings.warn(f"{error}; the pretraining begins anew", DamagedWarning, stacklevel=2)
+            return None
+
+    def _rehearsal(self, seed: int) -> Path:
+        return self.seed_folder(seed) / "pretraining.npz"
 
     def median_seed(self) -> int:
         """The seed with the median MAE on the first of the paper's scenarios; before there is a summary the first."""
@@ -149,9 +239,17 @@ class Run:
         return json.loads(path.read_text())["median_seed"] if path.exists() else self.config.seed
 
     def rows(self, seed: int) -> list[dict[str, Any]]:
-        """Rows of metrics.jsonl, one an epoch."""
+        """Rows of metrics.jsonl, one an epoch; a last one that was not written to its end is none.
+
+        Raises:
+            ValueError: another line is not readable.
+        """
         path = self.seed_folder(seed) / "metrics.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        lines = path.read_text().split("\n")[:-1] if path.exists() else []
+        try:
+            return [json.loads(line) for line in lines]
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from None
 
     def append(self, seed: int, row: dict[str, Any]) -> None:
         """One row more."""
@@ -163,11 +261,10 @@ class Run:
         for later, path in self.checkpoints(seed).items():
             if later > epoch:
                 path.unlink()
+        for partial in self.seed_folder(seed).glob("*.partial"):  # left by a kill
+            partial.unlink()
         rows = [json.dumps(row) + "\n" for row in self.rows(seed) if row["epoch"] <= epoch]
-        path = self.seed_folder(seed) / "metrics.jsonl"
-        partial = path.with_suffix(".partial")
-        partial.write_text("".join(rows))
-        partial.replace(path)
+        checkpoint.write(self.seed_folder(seed) / "metrics.jsonl", "".join(rows).encode())
 
 
 def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
@@ -200,7 +297,9 @@ def surroundings() -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    partial.replace(path)
+    """Write JSON, whole or not at all.
+
+    Raises:
+        OSError: it can't be written; `path` is as it was.
+    """
+    checkpoint.write(path, (json.dumps(content, indent=2) + "\n").encode())

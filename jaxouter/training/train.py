@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 
 from jaxouter.training import devices
+from jaxouter.training.pretraining import Rehearsal
 from jaxouter.training.run import Run
 from jaxouter.training.trainer import Trainer, TrainState
 
@@ -19,7 +21,27 @@ Pretrained = Callable[[int, int], None]
 
 
 class _StoppedError(Exception):
-    """Asked to end early before there was anything to save."""
+    """Asked to end early during the start."""
+
+
+class Pace:
+    """How often to save: so that saving takes no more than a share of the time."""
+
+    SHARE = 0.02
+
+    def __init__(self) -> None:
+        self._took, self._ended = 0.0, -math.inf
+
+    def due(self) -> bool:
+        """Whether enough time has passed since the last one."""
+        return time.monotonic() - self._ended >= self._took / self.SHARE
+
+    def save(self, what: Callable[[], None]) -> None:
+        """Do it, and take the time."""
+        begun = time.monotonic()
+        what()
+        self._ended = time.monotonic()
+        self._took = self._ended - begun
 
 
 def train(
@@ -32,13 +54,14 @@ def train(
     """Train every seed of a run to the end, from the newest epoch of which all have a checkpoint, or from the start.
 
     Each epoch is run for all seeds, as many at a time as the devices take, before the next one. Called in every
-    process; the first one alone reads and writes the folder, and calls `on_epoch` and `report`.
+    process; the first one alone reads and writes the folder, and calls `on_epoch` and `report`. Everything is saved at
+    the end, where it ends early, and as often in between as `Pace` allows.
 
     Args:
         run: folder; metrics and checkpoints go there.
         on_epoch: called with trainer and state after each epoch; what it returns joins the row (evaluation).
         report: called with seed and row after each epoch (progress).
-        stop: asked after each epoch whether to end early; everything is saved then. All processes end if one does.
+        stop: asked after each epoch of all seeds whether to end early. All processes end if one does.
         pretrained: called with seed and gradient steps done as the actor is pretrained (progress).
 
     Returns:
@@ -46,14 +69,19 @@ def train(
 
     Raises:
         ValueError: a checkpoint is not readable, the identification failed, or there are too few devices.
+        OSError: something can't be written; what was saved before is whole.
     """
     cfg, fleet, (trainer, params) = run.config, run.fleet, run.trainer
     done = int(devices.text_from_first(lambda: str(run.common_epoch())))
     rounds = [run.seeds[i : i + cfg.side_by_side] for i in range(0, cfg.seeds, cfg.side_by_side)]
+    pace = Pace()
 
-    def heard(seed: int, gradient_steps: int) -> None:
-        pretrained(seed, gradient_steps)
-        if jax.process_count() == 1 and stop():
+    def heard(seed: int, at: Rehearsal) -> None:
+        stopping = jax.process_count() == 1 and stop()
+        if stopping or int(at.done) == cfg.pretraining.gradient_steps or pace.due():
+            pace.save(lambda: run.save_rehearsal(seed, at))
+        pretrained(seed, int(at.done))
+        if stopping:
             raise _StoppedError
 
     begun = time.perf_counter()
@@ -61,16 +89,24 @@ def train(
         states = {seeds: _begin(run, seeds, done, heard) for seeds in rounds}
     except _StoppedError:
         return None
-    seconds = (time.perf_counter() - begun) / cfg.seeds
+
+    def every_seed() -> Iterator[tuple[int, TrainState]]:
+        for seeds in rounds:
+            taken = zip(seeds, fleet.take(states[seeds]), strict=True)
+            yield from taken if devices.is_first() else ()
+
+    def save(epoch: int) -> None:
+        for seed, state in every_seed():
+            run.save(seed, epoch, state)
+
     if cfg.pretraining.gradient_steps and not done:
-        for seeds in rounds:  # what the start gave is the row of epoch 0
-            for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True):
-                if devices.is_first() and not run.rows(seed):
-                    row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state)}
-                    row["seconds"] = seconds
-                    run.append(seed, row)
-                    run.save(seed, 0, state)
-                    report(seed, row)
+        seconds = (time.perf_counter() - begun) / cfg.seeds
+        for seed, state in every_seed():  # what the start gave is the row of epoch 0
+            row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state), "seconds": seconds}
+            if not run.rows(seed):
+                run.append(seed, row)
+                report(seed, row)
+        pace.save(lambda: save(0))
     for epoch in range(done, cfg.epochs):
         steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
         for seeds in rounds:
@@ -92,14 +128,16 @@ def train(
                     "updates_per_second": steps // cfg.environments * cfg.updates / seconds,
                 }
                 run.append(seed, row)
-                run.save(seed, epoch + 1, state)
                 report(seed, row)
-            if devices.any_process(stop()):
-                return None
+        stopping = devices.any_process(stop())
+        if devices.any_process(stopping or epoch + 1 == cfg.epochs or (devices.is_first() and pace.due())):
+            pace.save(lambda epoch=epoch: save(epoch + 1))
+        if stopping:
+            return None
     return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
 
 
-def _begin(run: Run, seeds: range, done: int, pretrained: Pretrained) -> TrainState:
+def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], None]) -> TrainState:
     """States of some seeds after so many epochs: from their checkpoints, or started and prefilled."""
     trainer, params = run.trainer
     like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
@@ -108,7 +146,9 @@ def _begin(run: Run, seeds: range, done: int, pretrained: Pretrained) -> TrainSt
 
     def whole(seed: int) -> TrainState:
         run.forget(seed, done if loads else -1)
-        return run.load(seed, done)[0] if loads else trainer.start(seed, params, lambda n: pretrained(seed, n))
+        if loads:
+            return run.load(seed, done)[0]
+        return trainer.start(seed, params, lambda at: heard(seed, at), run.load_rehearsal(seed))
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
     return states if loads or not run.config.epochs else run.fleet.prefill(states, params)

@@ -26,7 +26,7 @@ from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import pretrain
+from jaxouter.training.pretraining import Rehearsal, pretrain
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
 AXIS = "environments"  # over the shards of a learner
@@ -65,11 +65,18 @@ class Trainer:
         """The learner inside the policy."""
         return self.policy.learner
 
-    def start(self, seed: int, params: EnvParams, report: Callable[[int], None] = lambda done: None) -> TrainState:
+    def start(
+        self,
+        seed: int,
+        params: EnvParams,
+        report: Callable[[Rehearsal], None] = lambda at: None,
+        begin: Rehearsal | None = None,
+    ) -> TrainState:
         """State before the prefill.
 
         The static prefilter is identified where the policy is its residual, and the actor pretrained where that is
-        configured; `report` is called with the gradient steps done.
+        configured, from where a rehearsal of the same seed was stopped or from its beginning; `report` is called with
+        the rehearsal so far.
 
         Raises:
             ValueError: the identification failed.
@@ -80,10 +87,8 @@ class Trainer:
             state = state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
         if self.config.pretraining.gradient_steps:
             key_start = jax.random.fold_in(key_prior, PRETRAINING)
-            begin = self.policy_params(state)
-            actor = pretrain(
-                self.config.pretraining, self.env.plant, params.plant, self.policy, begin, key_start, report
-            )
+            cfg, plant, learned = self.config.pretraining, self.env.plant, self.policy_params(state)
+            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, report, begin)
             target = jax.tree.map(jnp.copy, actor)  # the state is donated, and no buffer twice
             state = state._replace(learner=state.learner._replace(actor=actor, target_actor=target))
         return state

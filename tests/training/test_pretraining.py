@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import counterfactual, identify
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.pretraining import ADAM, Teacher, Whitening
-from jaxouter.training.run import Run
+from jaxouter.training.run import DamagedWarning, Run
 from jaxouter.training.train import train
 from jaxouter.training.trainer import build
 from tests import lag
@@ -34,7 +35,7 @@ def config():
 def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
     trainer, params = build(config)
     heard = []
-    state = trainer.start(0, params, heard.append)
+    state = trainer.start(0, params, lambda at: heard.append(int(at.done)))
     assert heard == [50, 100]
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
@@ -128,11 +129,25 @@ def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
     assert [row["epoch"] for row in run.rows(0)] == [0, 1, 2]
 
 
-def test_it_stops_when_asked(config, tmp_path):
-    run = Run.create(config, tmp_path / "run")
-    assert train(run, stop=lambda: True) is None
-    assert run.checkpoints(0) == {}
-    assert run.rows(0) == []
+def test_a_start_that_was_stopped_goes_on_where_it_was(config, tmp_path):
+    whole, stopped = Run.create(config, tmp_path / "whole"), Run.create(config, tmp_path / "stopped")
+    finals, heard = train(whole), []
+    assert train(stopped, stop=lambda: True) is None
+    assert (stopped.checkpoints(0), stopped.rows(0)) == ({}, [])
+    resumed = train(Run.open(stopped.path), pretrained=lambda seed, done: heard.append(done))
+    assert heard == [100]
+    chex.assert_trees_all_equal(finals, resumed)
+    assert stopped.load_rehearsal(0) is None
+
+
+def test_a_damaged_start_begins_anew(config, tmp_path):
+    run, heard = Run.create(config, tmp_path / "run"), []
+    train(run, stop=lambda: True)
+    path = run.seed_folder(0) / "pretraining.npz"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.warns(DamagedWarning, match=r"pretraining\.npz is not a readable checkpoint"):
+        train(run, pretrained=lambda seed, done: heard.append(done))
+    assert heard == [50, 100]
 
 
 def test_the_actor_waits_until_the_critic_has_learned():

@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import chex
@@ -8,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxouter.training import checkpoint
-from jaxouter.training.run import KEEP, Run
-from jaxouter.training.train import train
+from jaxouter.training.run import KEEP, DamagedWarning, Run
+from jaxouter.training.train import Pace, train
 from tests.training.small import small
 
 
@@ -28,7 +29,7 @@ def test_stop_save_and_go_on_equals_an_uninterrupted_run(tmp_path):
     whole, halved = new_run(tmp_path / "whole", seeds=2), new_run(tmp_path / "halved", seeds=2)
     finals = train(whole)
     assert finals is not None
-    asked = iter([False, False, True])  # seed 0 has one epoch more than seed 1 then
+    asked = iter([False, True])
     assert train(halved, stop=lambda: next(asked)) is None
     again = Run.open(halved.path)
     resumed = train(again)
@@ -49,19 +50,109 @@ def test_rows_of_an_epoch_that_was_not_saved_are_dropped_on_resumption(tmp_path)
     assert [row["epoch"] for row in run.rows(0)] == [1, 2, 3]
 
 
+def test_a_row_that_was_not_written_to_its_end_is_none(tmp_path):
+    run = new_run(tmp_path / "run")
+    train(run, stop=lambda: True)
+    path = run.seed_folder(0) / "metrics.jsonl"
+    whole = path.read_text()
+    path.write_text(whole + whole[: len(whole) // 2])
+    assert len(run.rows(0)) == 1
+    run.forget(0, 1)
+    assert path.read_text() == whole
+    path.write_text("{\n" + whole)
+    with pytest.raises(ValueError, match=r"metrics\.jsonl is damaged"):
+        run.rows(0)
+
+
+def keep(run: Run, *epochs: int) -> None:
+    """Checkpoints of each seed after so many epochs; for seed 0 first."""
+    for seed, of_seed in zip(run.seeds, epochs, strict=True):
+        for epoch in of_seed:
+            checkpoint.save(run.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz", tree(), epoch=epoch)
+
+
 def test_seeds_go_on_together_from_the_newest_epoch_that_all_have(tmp_path):
     run = new_run(tmp_path / "run", seeds=3)
-    for seed, epochs in ((0, (1, 2)), (1, (1, 2)), (2, (1,))):
-        for epoch in epochs:
-            (run.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz").touch()
+    keep(run, (1, 2), (1, 2), (1,))
     assert run.common_epoch() == 1
     run.forget(0, 1)
     assert list(run.checkpoints(0)) == [1]
     (run.seed_folder(2) / "checkpoint-000001.npz").unlink()
     with pytest.raises(
-        ValueError, match=r"no checkpoint of the same epoch \(seed 0: \[1\]; seed 1: \[1, 2\]; seed 2: none"
+        ValueError, match=r"no whole checkpoint of the same epoch \(seed 0: \[1\]; seed 1: \[1, 2\]; seed 2: none"
     ):
         run.common_epoch()
+
+
+DAMAGE = {
+    "truncated": lambda content: content[: len(content) // 2],
+    "flipped": lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:],
+    "empty": lambda content: b"",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(tmp_path, damage):
+    whole, damaged = new_run(tmp_path / "whole"), new_run(tmp_path / "damaged")
+    finals = train(whole)
+    train(damaged, stop=iter([False, True]).__next__)
+    path = damaged.seed_folder(0) / "checkpoint-000002.npz"
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
+    with pytest.warns(DamagedWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
+        assert damaged.load(0)[1] == 1
+    with pytest.warns(DamagedWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
+        resumed = train(Run.open(damaged.path))
+    chex.assert_trees_all_equal(finals, resumed)
+    assert rows_without_times(whole, 0) == rows_without_times(damaged, 0)
+
+
+def test_where_every_checkpoint_is_damaged_nothing_starts_over_by_itself(tmp_path):
+    run = new_run(tmp_path / "run")
+    train(run)
+    for path in run.checkpoints(0).values():
+        path.write_bytes(b"")
+    with pytest.warns(DamagedWarning), pytest.raises(ValueError, match="no whole checkpoint"):
+        train(run)
+    assert len(run.checkpoints(0)) == KEEP
+
+
+def test_saving_takes_no_more_than_its_share(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    pace, saved = Pace(), []
+
+    def save():
+        now[0] += 0.1
+        saved.append(now[0])
+
+    while now[0] < 100.0:
+        now[0] += 0.7
+        if pace.due():
+            pace.save(save)
+    assert len(saved) == pytest.approx(100 / (0.1 / Pace.SHARE), abs=3)
+    assert 0.1 * len(saved) / now[0] < 1.05 * Pace.SHARE
+
+
+def test_a_folder_is_trained_by_one_process_at_a_time(tmp_path):
+    run = new_run(tmp_path / "run")
+    refused = pytest.raises(ValueError, match=rf"is being trained by process {os.getpid()}")
+    with run.lock(), refused, Run.open(run.path).lock():
+        pass
+    with run.lock():
+        pass
+
+
+def test_what_changed_since_the_run_was_made_is_listed(tmp_path):
+    run = new_run(tmp_path / "run")
+    assert run.changes() == []
+    content = json.loads((run.path / "config.json").read_text())
+    content["versions"]["jax"] = "0.1.0"
+    del content["flags"]["XLA_FLAGS"]
+    (run.path / "config.json").write_text(json.dumps(content))
+    assert set(run.changes()) == {
+        f"jax was 0.1.0 and is {jax.__version__}",
+        f"XLA_FLAGS was None and is {os.environ.get('XLA_FLAGS', '')}",
+    }
 
 
 def test_each_epoch_is_reported_with_what_on_epoch_gave(tmp_path):
@@ -124,6 +215,20 @@ def test_checkpoint_round_trip_keeps_values_types_and_keys(tmp_path):
     assert header["epoch"] == 4
     assert float(jax.random.normal(loaded["key"])) == float(jax.random.normal(jax.random.key(7)))
     assert list(tmp_path.iterdir()) == [tmp_path / "c.npz"]
+
+
+def test_checkpoint_of_the_format_without_checksum_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "c.npz"
+    checkpoint.save(path, tree())
+    body = path.read_bytes()[: -len(checkpoint.MARK) - 32]
+    path.write_bytes(body)
+    with pytest.raises(ValueError, match="has no checksum"):
+        checkpoint.load(path, tree())
+    monkeypatch.setattr(checkpoint, "FORMAT", 1)
+    checkpoint.save(path, tree())
+    path.write_bytes(path.read_bytes()[: -len(checkpoint.MARK) - 32])
+    monkeypatch.undo()
+    chex.assert_trees_all_equal(checkpoint.load(path, tree())[0], tree())
 
 
 def test_checkpoint_holds_no_pickle(tmp_path):

@@ -25,7 +25,7 @@ from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant, make
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import ADAM, Teacher, cosine, folded, rehearse
+from jaxouter.training.pretraining import ADAM, Rehearsal, Teacher, cosine, folded, rehearse
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
@@ -74,7 +74,11 @@ def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
             plant = counterfactual.plant(plant, longer.episode_steps)
         except ValueError:
             pass  # stepped itself
-        actor = rehearse(start, plant, of_plant, trainer.policy, learned, keys, lambda n: report(f"gradient step {n}"))
+
+        def heard(at: Rehearsal) -> None:
+            report(f"gradient step {at.done}")
+
+        actor = rehearse(start, plant, of_plant, trainer.policy, learned, keys, heard)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
         return kept(actor, learned.prior, {"gradient_steps": start.gradient_steps}, steps)
 

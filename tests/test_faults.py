@@ -1,0 +1,89 @@
+"""Training runs that are killed, run out of disk, or meet another on the same folder, through the real command."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxouter.training import checkpoint
+from jaxouter.training.run import Run
+from jaxouter.training.train import train
+from tests.training.small import small
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+TMPFS = ["unshare", "--user", "--map-root-user", "--mount"]
+
+
+def script(name):
+    """A script of the folder, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"scripts_{name}", SCRIPTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where its dataclasses look for their annotations
+    spec.loader.exec_module(module)
+    return module
+
+
+def begun(path: Path) -> Run:
+    """A run after its first epoch."""
+    run = Run.create(small(), path)
+    assert train(run, stop=lambda: True) is None
+    return run
+
+
+def ended(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*command], capture_output=True, text=True, timeout=250)
+
+
+def test_three_kills_change_nothing(tmp_path):
+    soak = script("soak")
+    content = soak.soak(soak.Options(kills=3, steps=8_640, out=tmp_path / "soak.json"))
+    assert len(content["kills"]) == 3
+
+
+@pytest.mark.parametrize("by", ["file system", "limit"])
+def test_a_full_disk_ends_the_run_with_one_line_and_leaves_the_last_checkpoint_whole(tmp_path, by):
+    """A file system that holds what there is and half a checkpoint more, or a limit of half a checkpoint a file."""
+    run = begun(tmp_path / "run")
+    (kept,) = run.checkpoints(0).values()
+    before, half = kept.read_bytes(), kept.stat().st_size // 2
+    command = [sys.executable, "-m", "jaxouter.train", "--resume"]
+    if by == "limit":
+        blocks = f"ulimit -f {half // 512}"
+        done = ended("sh", "-c", f"{blocks}; exec {' '.join(command)} {run.path}")
+    else:
+        if shutil.which("unshare") is None or subprocess.run([*TMPFS, "true"], capture_output=True).returncode:
+            pytest.skip("no user namespace can be made here")
+        used = sum(-(-path.stat().st_size // 4096) * 4096 for path in run.path.rglob("*")) + 16_384
+        disk = tmp_path / "disk"
+        disk.mkdir()
+        lines = [
+            f"mount -t tmpfs -o size={used + half} tmpfs {disk}",
+            f"cp -r {run.path} {disk}",
+            f"{' '.join(command)} {disk}/run; status=$?",
+            f"cp {disk}/run/seed-0/*.npz {tmp_path}; exit $status",
+        ]
+        done = ended(*TMPFS, "sh", "-ec", "\n".join(["set +e", *lines]))
+        kept = tmp_path / kept.name
+    assert done.returncode == 1, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
+    assert line.startswith("error: ")
+    assert "what was saved before is whole, go on with: python -m jaxouter.train --resume" in line
+    assert ("No space left on device" if by == "file system" else "File too large") in line
+    assert kept.read_bytes() == before
+    assert checkpoint.read(kept)[0]["epoch"] == 1
+    assert not list(run.path.rglob("*.partial"))
+
+
+def test_a_second_run_into_one_folder_is_refused(tmp_path):
+    run = begun(tmp_path / "run")
+    with run.lock():
+        files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+        done = ended(sys.executable, "-m", "jaxouter.train", "--resume", str(run.path))
+    assert done.returncode == 2
+    assert f"is being trained by process {os.getpid()}" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert files == {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
