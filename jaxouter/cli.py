@@ -123,6 +123,8 @@ class TrainingProgress:
             f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
             f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {row['mae']:.3f} {self._unit}"
         )
+        if row.get("skipped", 0) or row.get("no_action", 0):
+            text += f"  {row['skipped']:.1%} of the updates skipped, {row['no_action']:.1%} of the actions not finite"
         if console.is_terminal:
             if seed not in self._tasks:
                 self._tasks[seed] = self._bars.add_task("", total=cfg.epochs, seed=seed, text="")

@@ -25,7 +25,7 @@ from jaxouter.training import devices
 from jaxouter.training.config import TrainConfig, preset
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.run import FORMAT, Run, write_json
-from jaxouter.training.train import train
+from jaxouter.training.train import NotFiniteError, train
 from jaxouter.training.trainer import Trainer, TrainState
 
 
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
                 finals = learn(run, options.resume is not None)
                 if devices.is_first() and finals is not None:
                     report(run, finals, begun)
-            except OSError as error:
+            except (OSError, NotFiniteError) as error:
                 raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
     if finals is None:
         if devices.is_first():

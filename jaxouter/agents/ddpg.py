@@ -158,8 +158,12 @@ class DDPG:
         """The critic network."""
         return Critic(self.config.hidden, self.config.layer_norm)
 
-    def _average(self, gradient: Any) -> Any:
-        return gradient if self.axis is None else jax.lax.pmean(gradient, self.axis)
+    def _average(self, found: tuple[jax.Array, Any]) -> tuple[jax.Array, Any, jax.Array]:
+        """Loss and gradient over all parts of the batch, zero where the loss is not finite, and whether it is."""
+        loss, gradient = found if self.axis is None else jax.lax.pmean(found, self.axis)
+        finite = jnp.isfinite(loss)
+        loss, gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.zeros_like(leaf)), (loss, gradient))
+        return loss, gradient, finite
 
     def _rate(self, rate: float) -> float | optax.Schedule:
         decays = self.config.rate_decay == "cosine"
@@ -222,7 +226,8 @@ class DDPG:
             key: for TD3's target noise.
 
         Returns:
-            The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99).
+            The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99) and skipped: 1
+            where a loss is not finite, which then counts as zero and has no gradient.
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
@@ -239,12 +244,11 @@ class DDPG:
             return jnp.mean(jnp.sum((target[:, None] - q) ** 2, -1)), jnp.mean(q)
 
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
-        critics, critic_optimiser = descend(
-            self.critic_optimiser, self._average(gradient), state.critic_optimiser, state.critics
-        )
+        critic_value, gradient, critic_finite = self._average((critic_value, gradient))
+        critics, critic_optimiser = descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
-        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array]]:
+        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array, jax.Array]]:
             def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
                 before_tanh = self.before_tanh(actor, batch.obs)
                 action = jnp.tanh(before_tanh)
@@ -253,23 +257,24 @@ class DDPG:
                 return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
 
             (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
-            actor, optimiser = descend(
-                self.actor_optimiser, self._average(gradient), state.actor_optimiser, state.actor
-            )
+            loss, gradient, finite = self._average((loss, gradient))
+            actor, optimiser = descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
             state = state._replace(
                 actor=actor,
                 actor_optimiser=optimiser,
                 target_actor=optax.incremental_update(actor, state.target_actor, cfg.polyak),
                 target_critics=optax.incremental_update(state.critics, state.target_critics, cfg.polyak),
             )
-            return state, (loss, saturation)
+            return state, (loss, saturation, finite)
 
         if cfg.policy_delay == 1:
-            state, (actor_value, saturation) = move_actor(state)
+            state, (actor_value, saturation, actor_finite) = move_actor(state)
         else:
-            zeros = (jnp.zeros_like(critic_value), jnp.zeros_like(critic_value))
-            state, (actor_value, saturation) = jax.lax.cond(
-                state.updates % cfg.policy_delay == 0, move_actor, lambda s: (s, zeros), state
+            still = (jnp.zeros_like(critic_value), jnp.zeros_like(critic_value), jnp.ones_like(critic_finite))
+            state, (actor_value, saturation, actor_finite) = jax.lax.cond(
+                state.updates % cfg.policy_delay == 0, move_actor, lambda s: (s, still), state
             )
-        metrics = dict(critic_loss=critic_value, actor_loss=actor_value, q=q, saturation=saturation)
+        skipped = jnp.where(critic_finite & actor_finite, 0.0, 1.0)
+        q = jnp.where(critic_finite, q, 0.0)
+        metrics = dict(critic_loss=critic_value, actor_loss=actor_value, q=q, saturation=saturation, skipped=skipped)
         return state, metrics

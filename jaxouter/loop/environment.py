@@ -84,7 +84,7 @@ class Environment:
         Args:
             key: randomness of plant and sensor.
             state: at t_k.
-            action: r~_k, scalar, clipped to its bounds.
+            action: r~_k, scalar, clipped to its bounds; in place of NaN r_k.
             params: traced parameters.
 
         Returns:
@@ -93,7 +93,7 @@ class Environment:
         """
         chex.assert_rank(action, 0)
         plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
-        r_tilde = jnp.clip(action, *plant.r_tilde_bounds)
+        r_tilde = jnp.clip(jnp.where(jnp.isnan(action), state.r, action), *plant.r_tilde_bounds)
         plant_state = plant.step(p, state.plant, r_tilde, key)
         y = plant.output(p, plant_state)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxouter.training import devices
 from jaxouter.training.pretraining import Rehearsal
@@ -22,6 +23,10 @@ Pretrained = Callable[[int, int], None]
 
 class _StoppedError(Exception):
     """Asked to end early during the start."""
+
+
+class NotFiniteError(Exception):
+    """What was learned has become useless: numbers that are not finite."""
 
 
 class Pace:
@@ -70,6 +75,7 @@ def train(
     Raises:
         ValueError: a checkpoint is not readable, the identification failed, or there are too few devices.
         OSError: something can't be written; what was saved before is whole.
+        NotFiniteError: parameters are not finite any more; what was saved before is.
     """
     cfg, fleet, (trainer, params) = run.config, run.fleet, run.trainer
     done = int(devices.text_from_first(lambda: str(run.common_epoch())))
@@ -102,6 +108,7 @@ def train(
     if cfg.pretraining.gradient_steps and not done:
         seconds = (time.perf_counter() - begun) / cfg.seeds
         for seed, state in every_seed():  # what the start gave is the row of epoch 0
+            _check(seed, 0, state)
             row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state), "seconds": seconds}
             if not run.rows(seed):
                 run.append(seed, row)
@@ -117,6 +124,7 @@ def train(
             for i, (seed, state) in enumerate(zip(seeds, fleet.take(states[seeds]), strict=True)):
                 if not devices.is_first():
                     continue
+                _check(seed, epoch + 1, state)
                 row: Row = {
                     "epoch": epoch + 1,
                     "steps": int(state.steps),
@@ -135,6 +143,13 @@ def train(
         if stopping:
             return None
     return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
+
+
+def _check(seed: int, epoch: int, state: TrainState) -> None:
+    """Raises NotFiniteError, naming what is not finite."""
+    for name, part in state.learner._asdict().items():
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(part)):
+            raise NotFiniteError(f"seed {seed}, epoch {epoch}: {name.replace('_', ' ')} is not finite any more")
 
 
 def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], None]) -> TrainState:

@@ -29,6 +29,7 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import Rehearsal, pretrain
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
+DIVERGED = FIELDS.index("terminated")
 AXIS = "environments"  # over the shards of a learner
 PRETRAINING = 1  # folded into a key
 HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
@@ -206,7 +207,9 @@ class Trainer:
         more than one step.
 
         Returns:
-            The state, and means over the epoch: the learner's metrics and `reward` (a step, with exploration).
+            The state, and means over the epoch: the learner's metrics, `reward` (a step, with exploration), `diverged`
+            (share of the steps that ended an episode so) and `no_action` (share of actions that were not finite and
+            became zero).
         """
         cfg = self.config
         low, high = cfg.noise_sigma
@@ -237,6 +240,8 @@ class Trainer:
             volatility = sigma * (1.0 + (cfg.noise_end - 1.0) * progress)
             explore = noise.ornstein_uhlenbeck(state.noise, normal, cfg.noise_theta, volatility)
             action = jnp.clip(self.learner.act(learner.actor, state.obs)[:, 0] + explore, -1.0, 1.0)
+            finite = jnp.isfinite(action)
+            action = jnp.where(finite, action, 0.0)
             state, rows, reward, done = self.vector_step(state, params, action, keys_env)
 
             def update(learner: LearnerState, xs: tuple[Batch, chex.PRNGKey]) -> tuple[LearnerState, Any]:
@@ -245,6 +250,7 @@ class Trainer:
             learner, metrics = jax.lax.scan(update, learner, (batches, keys_update))
             state = state._replace(learner=learner, replay=replay, noise=jnp.where(done, 0.0, explore))
             metrics = {**jax.tree.map(jnp.mean, metrics), "reward": jnp.mean(reward)}
+            metrics |= {"diverged": jnp.mean(rows[:, DIVERGED]), "no_action": jnp.mean(jnp.where(finite, 0.0, 1.0))}
             return (state, rows, gathered(replay, bits)), metrics
 
         replay, rows = self.replay.take_back(state.replay)

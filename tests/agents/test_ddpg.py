@@ -85,6 +85,20 @@ def test_one_update_equals_ddpg_written_out():
     chex.assert_trees_all_close(after.target_actor, soft, atol=1e-6)
 
 
+@pytest.mark.parametrize("delay", [1, 2])
+def test_an_update_whose_loss_is_not_finite_is_skipped_and_counted(delay):
+    learner = DDPG(replace(SMALL, policy_delay=delay), 3)
+    state, batch = learner.init(jax.random.key(0)), random_batch(1)
+    broken = batch._replace(reward=batch.reward.at[0].set(jnp.inf))
+    after, metrics = learner.update(state, broken, jax.random.key(2))
+    chex.assert_trees_all_equal(after.critics, state.critics)
+    assert {name: float(metrics[name]) for name in ("skipped", "critic_loss")} == {"skipped": 1.0, "critic_loss": 0.0}
+    chex.assert_tree_all_finite((after, metrics))
+    again, metrics = learner.update(after, batch, jax.random.key(3))
+    assert float(metrics["skipped"]) == 0.0
+    assert not np.array_equal(jax.tree.leaves(again.critics)[1], jax.tree.leaves(state.critics)[1])
+
+
 def test_td3_with_its_tricks_off_is_ddpg():
     ddpg, td3 = DDPG(SMALL, 3), DDPG(replace(SMALL, critics=2, policy_delay=1, target_noise=0.0), 3)
     one = ddpg.init(jax.random.key(0))

@@ -430,3 +430,10 @@ def test_windows_of_recorded_signals_give_back_the_observations() -> None:
     chex.assert_trees_all_close(seen, before[0][at], atol=1e-5)
     chex.assert_trees_all_close(after, info["final_observation"][at], atol=1e-5)
     assert np.count_nonzero(np.asarray(states.k) == 0) == 3, "episodes must end inside the window"
+
+
+@pytest.mark.parametrize("plant", ["pitch", "heaters"])
+def test_an_action_that_is_no_number_shows_the_reference_itself(plant):
+    env, params = jaxouter.make(plant)
+    _, state = reset(env, KEY, params)
+    chex.assert_trees_all_equal(*(step(env, KEY, state, action, params) for action in (jnp.array(jnp.nan), state.r)))

@@ -10,7 +10,7 @@ import pytest
 
 from jaxouter.training import checkpoint
 from jaxouter.training.run import KEEP, DamagedWarning, Run
-from jaxouter.training.train import Pace, train
+from jaxouter.training.train import NotFiniteError, Pace, train
 from tests.training.small import small
 
 
@@ -114,6 +114,18 @@ def test_where_every_checkpoint_is_damaged_nothing_starts_over_by_itself(tmp_pat
     with pytest.warns(DamagedWarning), pytest.raises(ValueError, match="no whole checkpoint"):
         train(run)
     assert len(run.checkpoints(0)) == KEEP
+
+
+def test_parameters_that_are_not_finite_end_the_run_and_are_not_saved(tmp_path):
+    run = new_run(tmp_path / "run")
+    train(run, stop=lambda: True)
+    state, _ = run.load(0)
+    critics = jax.tree.map(lambda leaf: leaf.at[0].set(jnp.nan), state.learner.critics)
+    run.save(0, 1, state._replace(learner=state.learner._replace(critics=critics)))
+    with pytest.raises(NotFiniteError, match="seed 0, epoch 2: critics is not finite any more"):
+        train(run)
+    assert list(run.checkpoints(0)) == [1]
+    assert [row["epoch"] for row in run.rows(0)] == [1]
 
 
 def test_saving_takes_no_more_than_its_share(monkeypatch):

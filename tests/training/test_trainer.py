@@ -145,6 +145,28 @@ def test_exploration_stays_within_the_bounds_of_r_tilde():
     assert float(r_tilde.max()) == 40.0
 
 
+def test_a_plant_that_diverges_never_poisons_the_replay():
+    """With its actuator the wrong way round the pitch loop leaves its bounds within tens of steps."""
+    trainer, params = build(small("pitch", randomise=(("gain", -5.0, -1.0),)))
+    state, metrics = trainer.epoch(trainer.prefill(trainer.start(0, params), params), params, 960)
+    assert float(metrics["diverged"]) > 0.02
+    assert float(metrics["skipped"]) == float(metrics["no_action"]) == 0.0
+    low, high = trainer.env.plant.divergence_bounds
+    y = np.asarray(state.replay.rows[..., FIELDS.index("y_next")])
+    assert ((y == low) | (y == high)).any()
+    assert ((y >= low) & (y <= high)).all()
+    chex.assert_tree_all_finite((state.replay.rows, state.learner, state.obs, metrics))
+
+
+def test_actions_that_are_not_finite_become_zero_and_are_counted():
+    trainer, params = build(small())
+    state = trainer.prefill(trainer.start(0, params), params)
+    actor = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.learner.actor)
+    state, metrics = trainer.epoch(state._replace(learner=state.learner._replace(actor=actor)), params, 160)
+    assert float(metrics["no_action"]) == float(metrics["skipped"]) == 1.0
+    chex.assert_tree_all_finite((state.replay.rows, state.obs, state.env.y, state.learner.critics))
+
+
 def test_residual_starts_at_the_static_prefilter():
     trainer, params = build(small("pitch", residual=True))
     state = trainer.start(0, params)
