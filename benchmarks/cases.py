@@ -26,11 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxouter import plants
-from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 from jaxouter.training.devices import EIGEN, Fleet
+from jaxouter.training.plan import update_mflop
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 SGEMM, NORMALS = "sgemm_gflops", "normals_per_s"
@@ -39,7 +39,6 @@ QUICK_ENVIRONMENTS = (16, 4_096)
 SUBSTEPS = 10  # of heaters, an hour
 HOUSES, PLANTS = 1_000, 256
 FILLED = 4_096  # environment steps of the prefill; the replay is filled up with copies of them
-OPTIMISER_FLOP = 24  # a parameter: Adam, weight decay, Polyak
 
 
 @dataclass(frozen=True)
@@ -240,23 +239,6 @@ def policy_roll_out(plant: str, environments: int) -> Job:
         return jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(learned.prior, r, action)
 
     return roll_out(trainer.env, params, environments, act, learned)
-
-
-def update_mflop(config: DDPGConfig, observations: int) -> float:
-    """FLOP that an update needs, in millions, rounded: its matrix products and the optimiser; paper on pitch: 157.
-
-    Forward: target actor and target critic, critic, actor, and the critic once more for the actor's gradient. Backward:
-    gradients of all weights of actor and critic, of the inputs of all their layers but the first, and of the action.
-    One critic, one action.
-    """
-    hidden = config.hidden
-    inner = sum(a * b for a, b in pairwise(hidden)) + hidden[-1]
-    actor = observations * hidden[0] + inner
-    critic = actor + hidden[1]
-    to_action = hidden[1] + hidden[-1]
-    products = (2 * actor + 3 * critic) + (actor + critic) + 2 * inner + to_action
-    parameters = actor + critic + 2 * (sum(hidden) + 1)
-    return round((2 * config.batch_size * products + OPTIMISER_FLOP * parameters) / 1e6)
 
 
 def training(

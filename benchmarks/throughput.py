@@ -41,7 +41,7 @@ RESULTS = HERE / "results"
 GROUP = 8  # cases whose processes live at the same time
 PEERS = ("stable-baselines3", "sbx")
 PEER_UPDATES = 300  # a window
-PAPER_MFLOP = 157  # of an update of the preset `paper`, as `update_mflop` in cases.py counts it
+PAPER_MFLOP = 157  # of an update of the preset `paper`, as `update_mflop` counts it
 PITCH_FLOP = 2 * 16 * 17  # of a control step, one matrix product
 HEATERS_NORMALS = 4 * 10  # of an hour of 4 houses, one a substep
 

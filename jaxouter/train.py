@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import statistics
 import sys
 import time
@@ -22,8 +23,9 @@ from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.training import devices
-from jaxouter.training.config import TrainConfig, preset
+from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
+from jaxouter.training.plan import plan
 from jaxouter.training.run import FORMAT, Run, write_json
 from jaxouter.training.train import NotFiniteError, train
 from jaxouter.training.trainer import Trainer, TrainState
@@ -50,6 +52,8 @@ class Options:
     """Processes in all, each started with the same options but its own --process-id."""
     process_id: int | None = None
     """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
+    dry_run: bool = False
+    """Print configuration, shapes, memory and arithmetic, and end before any work."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
@@ -62,7 +66,7 @@ def parse(arguments: list[str]) -> Options:
     config = tyro.cli(Options, prog=program, args=plain, default=first).config
     options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(config.plant, config.preset)))
     if options.resume is not None:
-        execution = {name: getattr(options, name) for name in ("resume", *Processes.__dataclass_fields__)}
+        execution = {name: getattr(options, name) for name in ("resume", "dry_run", *Processes.__dataclass_fields__)}
         config = dataclasses.replace(first.config, devices=options.config.devices)
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
@@ -86,6 +90,11 @@ def main(arguments: list[str] | None = None) -> None:
             return cli.print_lists()
         cli.use_compilation_cache()
         config = options.config.check()
+        planned = plan(config)
+        if options.dry_run:
+            print(json.dumps(to_dict(config), indent=2))
+            return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], planned.lines)
+        planned.check()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
         devices.connect(config.devices, processes.check(config.devices))
         Fleet.of(config)  # what is left of the checks, before anything is written

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
+import msgspec
 import tyro
 
 from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop.identify import LEVELS
+
+HUGE = 2**31  # no number of a configuration is as large
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,9 @@ class TrainConfig:
             ValueError: names the field, its value and what is allowed.
         """
         plants.resolve(self.plant)
+        for name, value in _numbers(to_dict(self)):
+            if not -HUGE < value < HUGE:  # NaN is refused too
+                raise ValueError(f"{name} is {value}; it must be a number between -{HUGE:,} and {HUGE:,}")
         self.pretraining.check()
         self.ddpg.check()
         if (self.pretraining.plants > 1) and not self.randomise:
@@ -282,6 +289,18 @@ def preset(plant: str, name: str = "default") -> TrainConfig:
     return replace(presets[name], plant=plant)
 
 
+def _numbers(values: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """All numbers in nested values, with their names."""
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from _numbers(value, f"{name}.{key}" if name else key)
+    elif isinstance(values, tuple | list):
+        for value in values:
+            yield from _numbers(value, name)
+    elif isinstance(values, int | float):
+        yield name, values
+
+
 def to_dict(config: TrainConfig) -> dict[str, Any]:
     """Plain dict, for JSON."""
     return dataclasses.asdict(config)
@@ -291,23 +310,16 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     """The configuration from what `to_dict` gave, also after a round trip through JSON.
 
     Raises:
-        ValueError: a field is missing or unknown, or a value is not allowed.
+        ValueError: a field is missing, unknown or of another type.
     """
-
-    def frozen(value: Any) -> Any:
-        return tuple(map(frozen, value)) if isinstance(value, list) else value
-
-    def build(cls: type, values: dict[str, Any]) -> Any:
-        names = {f.name for f in dataclasses.fields(cls)}
-        if set(values) != names:
-            raise ValueError(f"the configuration has fields {sorted(set(values) ^ names)} missing or unknown")
-        return cls(**{name: frozen(value) for name, value in values.items()})
-
     # Runs of versions that knew one device only, no pretraining and no randomisation, go on as they were.
-    nested = {
-        "pretraining": build(
-            PretrainingConfig, dataclasses.asdict(PretrainingConfig()) | values.get("pretraining", {})
-        ),
-        "ddpg": build(DDPGConfig, {"actor_from": 0, **values.get("ddpg", {})}),
-    }
-    return build(TrainConfig, {"devices": 1, "randomise": (), **values, **nested})
+    whole = {"devices": 1, "randomise": (), "pretraining": {}, "ddpg": {}, **values}
+    for name, added in (("pretraining", dataclasses.asdict(PretrainingConfig())), ("ddpg", {"actor_from": 0})):
+        if not isinstance(whole[name], dict):
+            raise ValueError(f"{name} is {whole[name]!r}; it must be an object with its fields")
+        whole[name] = added | whole[name]
+    for cls, of_cls in ((TrainConfig, whole), (PretrainingConfig, whole["pretraining"]), (DDPGConfig, whole["ddpg"])):
+        names = {f.name for f in dataclasses.fields(cls)}
+        if set(of_cls) != names:
+            raise ValueError(f"the configuration has fields {sorted(map(str, set(of_cls) ^ names))} missing or unknown")
+    return msgspec.convert(whole, TrainConfig)

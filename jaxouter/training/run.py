@@ -117,11 +117,11 @@ class Run:
     def changes(self) -> list[str]:
         """What the results depend on and is no longer what it was when the run was made."""
         before, now = json.loads((self.path / "config.json").read_text()), surroundings()
-        pairs = [
-            (name, before.get(group, {}).get(name), value)
-            for group, values in now.items()
-            for name, value in values.items()
-        ]
+        pairs = []
+        for group, values in now.items():
+            was = before.get(group)
+            known = was if isinstance(was, dict) else {}
+            pairs += [(name, known.get(name), value) for name, value in values.items()]
         return [f"{name} was {was} and is {value}" for name, was, value in pairs if was != value]
 
     @property

@@ -19,6 +19,7 @@ from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Signals
 from jaxouter.loop.references import Reaimed, SetPoint
 from tests import lag
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 STEPS = 160  # of a roll-out: three episodes of the lag, and a part
@@ -84,18 +85,18 @@ def test_reset_and_step_have_the_shapes_and_types_of_gymnax() -> None:
     new_obs, new_state, reward, terminated, truncated, info = after
     chex.assert_trees_all_equal_shapes_and_dtypes((obs, state), (new_obs, new_state))
     chex.assert_shape([reward, terminated, truncated], ())
-    chex.assert_type([obs, reward, info["final_observation"], info["r"], info["y"]], jnp.float32)
+    chex.assert_type([obs, reward, info["final_observation"], info["r"], info["y"]], FLOAT)
     chex.assert_type([terminated, truncated], jnp.bool_)
     chex.assert_equal_shape([obs, info["final_observation"]])
 
 
 @pytest.mark.parametrize("name", ["pitch", "heaters"])
-def test_plants_of_the_paper_keep_shapes_and_single_precision(name: str) -> None:
+def test_plants_of_the_paper_keep_shapes_and_precision(name: str) -> None:
     env, params = jaxouter.make(name)
     before = jax.eval_shape(env.reset, KEY, params)
     obs, state, reward, *_ = jax.eval_shape(env.step, KEY, before[1], scalar(1.0), params)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, (obs, state))
-    assert (obs.dtype, reward.dtype) == (jnp.float32, jnp.float32)
+    assert (obs.dtype, reward.dtype) == (FLOAT, FLOAT)
 
 
 def test_action_must_be_scalar() -> None:

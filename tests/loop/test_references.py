@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, redrawn, telegraph, wander
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 STEPS = 200
@@ -36,7 +37,7 @@ def runs(r: np.ndarray) -> list[tuple[float, int]]:
 def test_family_stays_in_its_range_and_differs_from_member_to_member(kind: str) -> None:
     r = members(kind)
     chex.assert_shape(r, (MEMBERS, STEPS))
-    chex.assert_type(r, jnp.float32)
+    chex.assert_type(r, FLOAT)
     assert r.min() >= LOW - 1e-5
     assert r.max() <= HIGH + 1e-5
     assert len(np.unique(r, axis=0)) == MEMBERS
@@ -124,7 +125,7 @@ def test_telegraph_redrawn_with_certainty_changes_at_each_step() -> None:
 @pytest.mark.parametrize("redraw", [0.02, 0.2])
 def test_telegraph_holds_levels_of_the_range_and_changes_as_often_as_asked(redraw: float) -> None:
     r = telegraphs(redraw)
-    chex.assert_type(r, jnp.float32)
+    chex.assert_type(r, FLOAT)
     assert LOW <= r.min() < LOW + 0.5
     assert HIGH - 0.5 < r.max() <= HIGH
     n = MEMBERS * (STEPS - 1)

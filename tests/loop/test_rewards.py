@@ -14,6 +14,7 @@ from jaxouter.loop import rewards
 from jaxouter.plants import Plant
 from jaxouter.plants.heaters import HEATERS
 from jaxouter.plants.pitch import PITCH
+from tests.precision import FLOAT
 
 
 def below(value: float) -> float:
@@ -121,4 +122,4 @@ def test_constants_are_swept_under_vmap() -> None:
 
     swept = jax.vmap(lane)(prices)
     chex.assert_trees_all_close(swept, -2.0 * prices)
-    chex.assert_type(swept, jnp.float32)
+    chex.assert_type(swept, FLOAT)

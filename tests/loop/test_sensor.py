@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxouter.loop import sensor
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 N = 20_000
@@ -23,7 +24,7 @@ def seen(y: float = 3.0, last: float = -7.0, n: int = N, **settings: float) -> n
 
 
 def test_default_is_perfect() -> None:
-    np.testing.assert_array_equal(seen(y=3.3), np.float32(3.3))
+    np.testing.assert_array_equal(seen(y=3.3), FLOAT.type(3.3))
 
 
 def test_bias_is_added() -> None:
@@ -59,7 +60,7 @@ def test_parameters_are_traced() -> None:
     y = jnp.asarray(3.0, float)
     lanes = jax.vmap(lambda bias: sensor.measure(replace(p, bias=bias), KEY, y, y))(biases)
     np.testing.assert_allclose(lanes, [3.0, 4.0, 5.0])
-    assert lanes.dtype == jnp.float32
+    assert lanes.dtype == FLOAT
 
 
 @pytest.mark.parametrize("settings", [{"noise": -0.1}, {"missing": -0.1}, {"missing": 1.1}])

@@ -15,6 +15,7 @@ import pytest
 import jaxouter
 from jaxouter.plants import heaters, make, simulate
 from jaxouter.plants.heaters import HEATERS, HeatersParams, HeatersState, Law
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 SETPOINTS = np.repeat([15.0, 20.0, 17.0, 22.0], 50)  # degC
@@ -323,13 +324,13 @@ def test_one_hour_is_the_same_without_jit() -> None:
     chex.assert_trees_all_close(compiled, plain, atol=1e-5)
 
 
-def test_step_keeps_shapes_and_single_precision() -> None:
+def test_step_keeps_shapes_and_precision() -> None:
     params = nominal(n=7)
     before = HEATERS.training_start(KEY, params)
     after = jax.eval_shape(HEATERS.step, params, before, scalar(22.0), KEY)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
     chex.assert_shape(before.x, (7,))
-    chex.assert_type([before.x, before.x0, HEATERS.output(params, before)], jnp.float32)
+    chex.assert_type([before.x, before.x0, HEATERS.output(params, before)], FLOAT)
 
 
 def test_output_is_differentiable_in_the_modified_reference() -> None:

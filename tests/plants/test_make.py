@@ -15,6 +15,7 @@ from jaxouter.plants import REGISTRY, make, resolve, simulate
 from jaxouter.plants.base import Plant
 from jaxouter.plants.heaters import HEATERS
 from jaxouter.plants.pitch import PITCH
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 
@@ -109,7 +110,7 @@ def test_simulate_wants_one_sequence(shape: tuple[int, ...]) -> None:
 def test_simulate_takes_plain_numbers() -> None:
     y = simulate(*make("heaters"), [20, 21, 22], KEY)
     chex.assert_shape(y, (3,))
-    chex.assert_type(y, jnp.float32)
+    chex.assert_type(y, FLOAT)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 
 from jaxouter.plants import make, simulate
 from jaxouter.plants.pitch import PITCH, W_PRINTED, PitchParams, PitchState
+from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
 STEPS = 200
@@ -311,12 +312,12 @@ def test_one_step_is_the_same_without_jit() -> None:
     chex.assert_trees_all_close(compiled, plain, atol=1e-5)
 
 
-def test_step_keeps_shapes_and_single_precision() -> None:
+def test_step_keeps_shapes_and_precision() -> None:
     params = nominal()
     before = PITCH.training_start(KEY, params)
     after = jax.eval_shape(PITCH.step, params, before, scalar(16.0), KEY)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
-    chex.assert_type([*before[:-1], PITCH.output(params, before)], jnp.float32)
+    chex.assert_type([*before[:-1], PITCH.output(params, before)], FLOAT)
 
 
 @pytest.mark.slow

@@ -1,0 +1,7 @@
+"""The precision in which the suite runs: single, or double under JAX_ENABLE_X64=1."""
+
+import jax
+import numpy as np
+
+X64 = bool(jax.config.read("jax_enable_x64"))
+FLOAT = np.dtype(np.float64 if X64 else np.float32)
