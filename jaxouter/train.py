@@ -22,12 +22,12 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.training import devices
+from jaxouter.training import devices, tensorboard
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.plan import plan
 from jaxouter.training.run import FORMAT, Run, write_json
-from jaxouter.training.train import NotFiniteError, train
+from jaxouter.training.train import NotFiniteError, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
 
 
@@ -43,8 +43,8 @@ class Options:
     out: Path | None = None
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Go on with the run in this folder; takes no other option but --devices (draws go on otherwise where a learner
-    then spans another number of them) and how to find the other processes."""
+    """Go on with the run in this folder; takes no other option but --tensorboard, --dry-run, --devices (draws go on
+    otherwise where a learner then spans another number of them) and how to find the other processes."""
     coordinator: str | None = None
     """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
     several SLURM tasks or an indexed Kubernetes job (with `jax[k8s]`) JAX finds this and the next two by itself."""
@@ -52,6 +52,8 @@ class Options:
     """Processes in all, each started with the same options but its own --process-id."""
     process_id: int | None = None
     """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
+    tensorboard: bool = False
+    """Write the metrics as TensorBoard events too, beside metrics.jsonl; needs the extra `tensorboard`."""
     dry_run: bool = False
     """Print configuration, shapes, memory and arithmetic, and end before any work."""
     list: bool = False
@@ -66,12 +68,15 @@ def parse(arguments: list[str]) -> Options:
     config = tyro.cli(Options, prog=program, args=plain, default=first).config
     options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(config.plant, config.preset)))
     if options.resume is not None:
-        execution = {name: getattr(options, name) for name in ("resume", "dry_run", *Processes.__dataclass_fields__)}
+        execution = {
+            name: getattr(options, name)
+            for name in ("resume", "dry_run", "tensorboard", *Processes.__dataclass_fields__)
+        }
         config = dataclasses.replace(first.config, devices=options.config.devices)
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
-                "--resume takes no other option but --devices, --coordinator, --num-processes and --process-id: "
-                "the run folder holds them all"
+                "--resume takes no other option but --devices, --coordinator, --num-processes, --process-id, "
+                "--tensorboard and --dry-run: the run folder holds them all"
             )
         run = Run.open(options.resume).config
         given = any(argument.split("=")[0] == "--devices" for argument in arguments)
@@ -95,6 +100,8 @@ def main(arguments: list[str] | None = None) -> None:
             print(json.dumps(to_dict(config), indent=2))
             return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], planned.lines)
         planned.check()
+        if options.tensorboard:
+            tensorboard.require()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
         devices.connect(config.devices, processes.check(config.devices))
         Fleet.of(config)  # what is left of the checks, before anything is written
@@ -103,7 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
         with ExitStack() as stack:
             devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
             try:
-                finals = learn(run, options.resume is not None)
+                finals = learn(run, options)
                 if devices.is_first() and finals is not None:
                     report(run, finals, begun)
             except (OSError, NotFiniteError) as error:
@@ -119,14 +126,14 @@ def go_on(run: Run) -> str:
     return f"go on with: python -m jaxouter.train --resume {run.path}"
 
 
-def learn(run: Run, resumed: bool) -> dict[int, TrainState] | None:
+def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
     """Train with progress, until the end or a signal."""
     config, trainer = run.config, run.trainer[0]
     if devices.is_first():
         print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
         for name, low, high in config.randomise:
             print(f"each plant has its own {name}, from {low:g} to {high:g}")
-        for change in run.changes() if resumed else ():
+        for change in run.changes() if options.resume is not None else ():
             print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
     watched = scenarios.get(scenarios.paper_scenarios(config.plant)[0])
 
@@ -136,7 +143,15 @@ def learn(run: Run, resumed: bool) -> dict[int, TrainState] | None:
         return {"mae": mae(traces)}
 
     with cli.Interrupt() as interrupt, cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
-        finals = train(run, watch, progress, lambda: interrupt.requested, progress.pretrained)
+        events = tensorboard.Events(run)
+
+        def heard(seed: int, row: Row) -> None:
+            progress(seed, row)
+            if options.tensorboard:
+                events(seed, row)
+
+        finals = train(run, watch, heard, lambda: interrupt.requested, progress.pretrained)
+        events.close()
     devices.part()
     return finals
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tensorboardX.proto import event_pb2
 
 from jaxouter import evaluate, train
 from jaxouter.plants import REGISTRY
@@ -47,7 +49,7 @@ def test_train_writes_the_run_folder(trained):
     for seed in (3, 4):
         rows = [json.loads(line) for line in (folder / f"seed-{seed}" / "metrics.jsonl").read_text().splitlines()]
         assert [row["steps"] for row in rows] == [1120, 1600]
-        assert {"mae", "reward", "critic_loss", "updates_per_second", "steps_per_second"} <= set(rows[0])
+        assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
     assert names == {"paper.png", "learning-curve.png", "heaters-paper-4.png", "heaters-paper-1000.png"}
     summary = json.loads((folder / "summary.json").read_text())
@@ -107,6 +109,15 @@ def test_evaluate_through_its_entry_point_writes_figures_and_traces(tmp_path):
     with np.load(tmp_path / "out.npz") as arrays:
         assert arrays["pitch/staircase/r_tilde"].shape == (2, 600)
         assert len(arrays.files) == 6
+
+
+def test_a_dry_run_shows_shapes_memory_and_arithmetic_and_does_nothing(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    train.main(["pitch", "--preset", "paper", "--dry-run"])
+    out = capsys.readouterr().out
+    for text in ('"batch_size": 64', "33 - 400 - 300 - 1, 134,201 parameters", "157 MFLOP each", "memory in all"):
+        assert text in out
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_list_names_plants_presets_scenarios_and_policies(capsys):
@@ -217,6 +228,27 @@ def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
     done = len(run.rows(0))
     assert 0 < done < run.config.epochs
     assert run.load(0)[1] == done
+
+
+def test_metrics_are_tensorboard_events_too(trained):
+    """Also those of rows that were there before; of each value the row's, once."""
+    _, folder = trained
+    shutil.copytree(folder, folder.parent / "events")
+    run = Run.open(folder.parent / "events")
+    for seed in run.seeds:
+        run.forget(seed, 0)  # both epochs run again
+    train.main(["--resume", str(run.path), "--tensorboard"])
+    for seed in run.seeds:
+        (path,) = run.seed_folder(seed).glob("events.out.tfevents.*")
+        content, found = path.read_bytes(), []
+        while content:  # records of a length (8 bytes), its checksum (4), the event and its checksum (4)
+            size = int.from_bytes(content[:8], "little")
+            event = event_pb2.Event.FromString(content[12 : 12 + size])
+            found += [(value.tag, event.step, value.simple_value) for value in event.summary.value]
+            content = content[16 + size :]
+        expected = [(name, row["steps"], np.float32(value)) for row in run.rows(seed) for name, value in row.items()]
+        assert len(run.rows(seed)) == 2
+        assert sorted(found) == sorted(expected)
 
 
 def test_resume_of_a_finished_run_only_shows_it_again(trained, capsys):

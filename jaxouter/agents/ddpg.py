@@ -217,17 +217,21 @@ class DDPG:
         """Q of each critic: (B, n), (B, m) -> (B, critics)."""
         return jnp.stack([cast(jax.Array, self.critic.apply(critic, obs, action)) for critic in critics], -1)
 
-    def update(self, state: LearnerState, batch: Batch, key: chex.PRNGKey) -> tuple[LearnerState, dict[str, jax.Array]]:
+    def update(
+        self, state: LearnerState, batch: Batch, key: chex.PRNGKey, norms: bool = False
+    ) -> tuple[LearnerState, dict[str, Any]]:
         """One gradient step of critic, actor and targets (paper eq. 2 to 5, algorithm 1).
 
         Args:
             state: learner.
             batch: transitions (B, ...).
             key: for TD3's target noise.
+            norms: report norms of the gradients too, for which each is read once more.
 
         Returns:
             The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99) and skipped: 1
-            where a loss is not finite, which then counts as zero and has no gradient.
+            where a loss is not finite, which then counts as zero and has no gradient. With `norms` also
+            critic_gradient and actor_gradient.
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
@@ -245,10 +249,11 @@ class DDPG:
 
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
         critic_value, gradient, critic_finite = self._average((critic_value, gradient))
+        of_critics = optax.tree.norm(gradient) if norms else None
         critics, critic_optimiser = descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
-        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[jax.Array, jax.Array, jax.Array]]:
+        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[Any, ...]]:
             def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
                 before_tanh = self.before_tanh(actor, batch.obs)
                 action = jnp.tanh(before_tanh)
@@ -265,16 +270,17 @@ class DDPG:
                 target_actor=optax.incremental_update(actor, state.target_actor, cfg.polyak),
                 target_critics=optax.incremental_update(state.critics, state.target_critics, cfg.polyak),
             )
-            return state, (loss, saturation, finite)
+            return state, (loss, saturation, finite, optax.tree.norm(gradient) if norms else None)
 
         if cfg.policy_delay == 1:
-            state, (actor_value, saturation, actor_finite) = move_actor(state)
+            state, (actor_value, saturation, actor_finite, of_actor) = move_actor(state)
         else:
-            still = (jnp.zeros_like(critic_value), jnp.zeros_like(critic_value), jnp.ones_like(critic_finite))
-            state, (actor_value, saturation, actor_finite) = jax.lax.cond(
+            zero = jnp.zeros_like(critic_value)
+            still = (zero, zero, jnp.ones_like(critic_finite), zero if norms else None)
+            state, (actor_value, saturation, actor_finite, of_actor) = jax.lax.cond(
                 state.updates % cfg.policy_delay == 0, move_actor, lambda s: (s, still), state
             )
         skipped = jnp.where(critic_finite & actor_finite, 0.0, 1.0)
         q = jnp.where(critic_finite, q, 0.0)
         metrics = dict(critic_loss=critic_value, actor_loss=actor_value, q=q, saturation=saturation, skipped=skipped)
-        return state, metrics
+        return state, metrics | (dict(critic_gradient=of_critics, actor_gradient=of_actor) if norms else {})

@@ -154,7 +154,7 @@ class Teacher:
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
             cost, gradient = jax.value_and_grad(loss)(actor, keys)
-            finite = jnp.isfinite(optax.global_norm(gradient))  # else nothing is learned from these episodes
+            finite = jnp.isfinite(optax.tree.norm(gradient))  # else nothing is learned from these episodes
             gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
             with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
                 step, state = ADAM.update(gradient, state)

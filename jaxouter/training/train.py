@@ -130,6 +130,7 @@ def train(
                     "steps": int(state.steps),
                     "updates": int(state.learner.updates),
                     **{name: float(value[i]) for name, value in metrics.items()},
+                    **{name: float(value) for name, value in trainer.diagnose(state, params).items()},
                     **on_epoch(trainer, state),
                     "seconds": seconds,
                     "steps_per_second": steps / seconds,

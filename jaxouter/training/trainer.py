@@ -32,6 +32,8 @@ FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
 DIVERGED = FIELDS.index("terminated")
 AXIS = "environments"  # over the shards of a learner
 PRETRAINING = 1  # folded into a key
+DIAGNOSIS = 2  # likewise
+EPISODES = 16  # of a diagnosis
 HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
 
 
@@ -259,6 +261,45 @@ class Trainer:
         state = state._replace(replay=self.replay.write(state.replay, rows))
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics if self.shards == 1 else jax.lax.pmean(metrics, AXIS)
+
+    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
+    def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
+        """What tells whether the learning is sound; of the state of all shards, which stays as it is.
+
+        Returns:
+            critic_gradient, actor_gradient: norms on one batch; replay_age: mean age of what is drawn, in environment
+            steps; q_start, return_start: what the critic expects of fresh training episodes, and what came, discounted
+            and in its scale, without exploration and bootstrapped where time is up.
+        """
+        key_batch, key_update, key_run = jax.random.split(jax.random.fold_in(state.key, DIAGNOSIS), 3)
+        bits = jax.random.bits(key_batch, (self.config.ddpg.batch_size, 2), jnp.uint32)
+        _, of_batch = self.learner.update(state.learner, self.batch(state.replay, bits), key_update, norms=True)
+        expected, came = jax.vmap(self._episode, (0, None, None))(jax.random.split(key_run, EPISODES), state, params)
+        rows = jnp.minimum(state.replay.written, self.replay.steps).astype(expected.dtype)
+        return {name: of_batch[name] for name in ("critic_gradient", "actor_gradient")} | {
+            "replay_age": self.config.environments * (rows - 1.0) / 2.0,
+            "q_start": jnp.mean(expected),
+            "return_start": jnp.mean(came),
+        }
+
+    def _episode(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+        """Value that the first critic gives to an episode's start, and the discounted return."""
+        learner, gamma = state.learner, self.config.ddpg.discount
+
+        def value(obs: jax.Array) -> jax.Array:
+            action = self.learner.act(learner.actor, obs)
+            return self.learner.values(learner.critics[:1], obs[None], action[None])[0, 0]
+
+        def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
+            obs, env, weight = carry
+            r_tilde = self.policy.r_tilde(state.prior, env.r, self.learner.act(learner.actor, obs)[0])
+            obs, env, reward, terminated, _, _ = self.env.step_env(key, env, r_tilde, params)
+            return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
+
+        obs, env = self.env.reset(key, params)
+        keys = jax.random.split(key, self.env.plant.episode_steps)
+        (last, _, weight), rewards = jax.lax.scan(step, (obs, env, jnp.ones_like(env.y)), keys)
+        return value(obs), self.config.reward_scale * jnp.sum(rewards) + weight * value(last)
 
 
 def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxouter.training.devices import Fleet
-from jaxouter.training.trainer import FIELDS, build
+from jaxouter.training.trainer import DIAGNOSIS, EPISODES, FIELDS, build
 from tests.training.small import small
 
 SMALL = small(replay=640)  # full after the prefill
@@ -165,6 +165,31 @@ def test_actions_that_are_not_finite_become_zero_and_are_counted():
     state, metrics = trainer.epoch(state._replace(learner=state.learner._replace(actor=actor)), params, 160)
     assert float(metrics["no_action"]) == float(metrics["skipped"]) == 1.0
     chex.assert_tree_all_finite((state.replay.rows, state.obs, state.env.y, state.learner.critics))
+
+
+def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes():
+    trainer, params = build(small(reward_scale=0.5))
+    state, _ = trainer.epoch(trainer.prefill(trainer.start(0, params), params), params, 960)
+    before = copy(state)
+    found = trainer.diagnose(state, params)
+    chex.assert_trees_all_equal(state, before)
+    assert float(found["replay_age"]) == 8 * (200 - 1) / 2  # 1,600 steps of 8 environments, and the replay holds them
+    assert float(found["critic_gradient"]) > 0
+    # Of a zero actor and critic the return is that of constant r~, 20 degC.
+    actor, critics = (jax.tree.map(jnp.zeros_like, part) for part in (state.learner.actor, state.learner.critics))
+    blind = trainer.diagnose(state._replace(learner=state.learner._replace(actor=actor, critics=critics)), params)
+    assert float(blind["q_start"]) == 0.0
+    key = jax.random.split(jax.random.fold_in(state.key, DIAGNOSIS), 3)[2]
+    gamma, returns = trainer.config.ddpg.discount, []
+    step = jax.jit(trainer.env.step_env)
+    for of_episode in jax.random.split(key, EPISODES):
+        _, env = trainer.env.reset(of_episode, params)
+        rewards = []
+        for of_step in jax.random.split(of_episode, trainer.env.plant.episode_steps):
+            _, env, reward, *_ = step(of_step, env, jnp.array(20.0), params)
+            rewards.append(float(reward))
+        returns.append(0.5 * np.sum(gamma ** np.arange(len(rewards)) * rewards))
+    assert float(blind["return_start"]) == pytest.approx(np.mean(returns), rel=1e-4)
 
 
 def test_residual_starts_at_the_static_prefilter():
