@@ -261,6 +261,17 @@ def test_damaged_checkpoint_is_named(tmp_path, damage):
         checkpoint.load(path, tree())
 
 
+def test_a_change_that_the_zip_file_itself_does_not_notice_is_found(tmp_path):
+    path = tmp_path / "c.npz"
+    checkpoint.save(path, tree())
+    content = bytearray(path.read_bytes())
+    content[10] ^= 1  # of the time at which the first array was written
+    path.write_bytes(content)
+    np.load(path)["header"]
+    with pytest.raises(ValueError, match="its checksum differs"):
+        checkpoint.load(path, tree())
+
+
 def test_checkpoint_of_another_configuration_is_refused(tmp_path):
     checkpoint.save(tmp_path / "c.npz", tree())
     with pytest.raises(ValueError, match="another configuration"):
