@@ -70,7 +70,7 @@ MUTANTS = (
     ),
     Mutant(
         "windows at the end of the replay's ring are stale",
-        "jaxouter/agents/replay.py", "buffer, slab, (0, twin, 0))", "buffer, slab, (0, position, 0))",
+        "jaxouter/agents/replay.py", "buffer, slab, twin, 1)", "buffer, slab, position, 1)",
         "tests/agents/test_replay.py",
     ),
     Mutant(

@@ -2,6 +2,9 @@
 
 import jax
 import numpy as np
+import pytest
 
 X64 = bool(jax.config.read("jax_enable_x64"))
 FLOAT = np.dtype(np.float64 if X64 else np.float32)
+
+makes_nan = pytest.mark.skipif(bool(jax.config.jax_debug_nans), reason="NaN is what it is about")

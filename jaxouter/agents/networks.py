@@ -50,6 +50,6 @@ class Critic(nn.Module):
                 x = dense(features, fan_in)(x) + dense(features, fan_in, use_bias=False, name="action")(action)
             else:
                 x = dense(features, x.shape[-1])(x)
-            x = nn.LayerNorm(param_dtype=float)(x) if self.layer_norm else x
+            x = nn.LayerNorm(param_dtype=float, force_float32_reductions=False)(x) if self.layer_norm else x
             x = nn.relu(x)
         return dense(1, x.shape[-1], 3e-3)(x)[..., 0]

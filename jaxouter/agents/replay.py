@@ -59,8 +59,8 @@ class Replay:
         slab = rows.astype(jnp.float32)[:, None, :]
         position = state.written % self.steps + self.mirror
         twin = jnp.where(position >= self.steps, position - self.steps, position)
-        buffer = jax.lax.dynamic_update_slice(state.rows, slab, (0, position, 0))
-        buffer = jax.lax.dynamic_update_slice(buffer, slab, (0, twin, 0))
+        buffer = jax.lax.dynamic_update_slice_in_dim(state.rows, slab, position, 1)
+        buffer = jax.lax.dynamic_update_slice_in_dim(buffer, slab, twin, 1)
         return ReplayState(buffer, state.written + 1)
 
     def take_back(self, state: ReplayState) -> tuple[ReplayState, jax.Array]:
@@ -69,9 +69,8 @@ class Replay:
         What `sample` draws from it is what it drew before that `write`.
         """
         position = (state.written - 1) % self.steps + self.mirror
-        size = (self.environments, 1, len(self.fields))
-        rows = jax.lax.dynamic_slice(state.rows, (0, position, 0), size)[:, 0]
-        return state._replace(written=state.written - 1), rows
+        rows = jax.lax.dynamic_slice_in_dim(state.rows, position, 1, 1)[:, 0]
+        return state._replace(written=state.written - 1), rows.astype(float)
 
     def sample(self, state: ReplayState, bits: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.

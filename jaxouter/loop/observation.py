@@ -102,6 +102,7 @@ class Observer:
             i: index in the window, H <= i < W.
         """
         back = jnp.arange(1, self.history + 1)
+        i = jnp.asarray(i).astype(back.dtype)
         age = window.age[i].astype(back.dtype)
         y0 = window.y[jnp.maximum(i - age, 0)]
         within = back <= age

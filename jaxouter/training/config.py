@@ -250,7 +250,7 @@ ROBUST_PITCH = replace(
         ("W[2]", -0.01, 0.01),
     ),
     pretraining=replace(
-        DEFAULT.pretraining, gradient_steps=7_500, episodes=512, plants=128, episode_steps=400, log_above=1.0
+        DEFAULT.pretraining, gradient_steps=12_000, episodes=512, plants=128, episode_steps=400, log_above=1.0
     ),
 )
 ROBUST_HEATERS = replace(

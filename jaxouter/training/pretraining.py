@@ -40,7 +40,7 @@ class Rehearsal(NamedTuple):
 
     before: Any  # whitened actors and optimiser state, each leaf (1, ...), of one report before
     now: Any  # the same, now
-    best: Any  # float32, mean reward
+    best: Any  # mean reward
     done: Any  # int32, gradient steps
 
     @classmethod
@@ -48,7 +48,7 @@ class Rehearsal(NamedTuple):
         """Before the first step, from an actor whose first layer takes the whitened observation."""
         actors = jax.tree.map(lambda leaf: leaf[None], actor)
         carry = actors, jax.vmap(ADAM.init)(actors)
-        return cls(carry, carry, np.float32(-np.inf), np.int32(0))
+        return cls(carry, carry, jnp.asarray(-np.inf, float), np.int32(0))
 
 
 class Whitening(NamedTuple):
@@ -250,11 +250,11 @@ def rehearse(
         chunk, school = rates[done : done + CHUNK], schools[done >= longer]
         carry, reward = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
         reward = np.asarray(reward)[:, 0]
-        best, reached = reward[0] if done == longer else max(at.best, reward[0]), reward[-LAST:].mean()
+        best, reached = reward[0] if done == longer else max(float(at.best), reward[0]), reward[-LAST:].mean()
         then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative
-            at = Rehearsal(at.now, carry, np.float32(max(best, reached)), then)
+            at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), then)
         else:
-            at = Rehearsal(at.before, at.before, np.float32(best), then)
+            at = Rehearsal(at.before, at.before, jnp.asarray(best, float), then)
         report(at)
     return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)

@@ -28,7 +28,7 @@ def filled(replay: Replay, written: int):
 @pytest.mark.parametrize(("lead", "window"), [(0, 1), (4, 1), (4, 3)])
 def test_windows_equal_those_of_a_plain_ring(written, lead, window):
     replay = Replay(FIELDS, ENVIRONMENTS, STEPS, lead, window)
-    rows, valid = replay.sample(filled(replay, written), jax.random.bits(jax.random.key(written), (500, 2)))
+    rows, valid = replay.sample(filled(replay, written), jax.random.bits(jax.random.key(written), (500, 2), jnp.uint32))
     chex.assert_shape([rows, valid], [(500, lead + window, 3), (500, lead + window)])
     kept = range(max(0, written - STEPS), written)
     seen = set()
@@ -51,7 +51,7 @@ def test_rows_are_float32_and_samples_have_the_default_float():
     replay = Replay(FIELDS, ENVIRONMENTS, STEPS, 2)
     state = filled(replay, 8)
     assert state.rows.dtype == jnp.float32
-    assert replay.sample(state, jax.random.bits(jax.random.key(0), (4, 2)))[0].dtype == jnp.zeros(()).dtype
+    assert replay.sample(state, jax.random.bits(jax.random.key(0), (4, 2), jnp.uint32))[0].dtype == jnp.zeros(()).dtype
 
 
 def test_write_and_sample_are_the_same_under_jit():
@@ -59,7 +59,7 @@ def test_write_and_sample_are_the_same_under_jit():
     state = filled(replay, 33)
     row = jnp.asarray(rows_at(33))
     chex.assert_trees_all_equal(jax.jit(replay.write)(state, row), replay.write(state, row))
-    bits = jax.random.bits(jax.random.key(3), (9, 2))
+    bits = jax.random.bits(jax.random.key(3), (9, 2), jnp.uint32)
     chex.assert_trees_all_equal(jax.jit(replay.sample)(state, bits), replay.sample(state, bits))
 
 
@@ -72,7 +72,7 @@ def test_what_is_taken_back_and_written_again_changes_nothing(written):
     assert int(before.written) == written - 1
     chex.assert_trees_all_equal(replay.write(before, rows), state)
     if written > 1:
-        bits = jax.random.bits(jax.random.key(2), (500, 2))
+        bits = jax.random.bits(jax.random.key(2), (500, 2), jnp.uint32)
         (drawn, valid), (then, _) = (replay.sample(s, bits) for s in (before, filled(replay, written - 1)))
         np.testing.assert_array_equal(drawn[valid], then[valid])
 

@@ -40,7 +40,7 @@ def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
-    assert reached > 0.9 * score(*identify.static(plant, of_plant, jax.random.key(0)), episodes)  # both negative
+    assert reached > 0.95 * score(*identify.static(plant, of_plant, jax.random.key(0)), episodes)  # both negative
     jax.tree.map(np.testing.assert_array_equal, state.learner.actor, state.learner.target_actor)
 
 

@@ -11,6 +11,7 @@ import pytest
 from jaxouter.training import checkpoint
 from jaxouter.training.run import KEEP, DamagedWarning, Run
 from jaxouter.training.train import NotFiniteError, Pace, train
+from tests.precision import FLOAT, makes_nan
 from tests.training.small import small
 
 
@@ -116,6 +117,7 @@ def test_where_every_checkpoint_is_damaged_nothing_starts_over_by_itself(tmp_pat
     assert len(run.checkpoints(0)) == KEEP
 
 
+@makes_nan
 def test_parameters_that_are_not_finite_end_the_run_and_are_not_saved(tmp_path):
     run = new_run(tmp_path / "run")
     train(run, stop=lambda: True)
@@ -254,7 +256,7 @@ def test_damaged_checkpoint_is_named(tmp_path, damage):
     path = tmp_path / "c.npz"
     checkpoint.save(path, tree())
     content = bytearray(path.read_bytes())
-    middle = content.index(np.arange(3.0, dtype=np.float32).tobytes())
+    middle = content.index(np.arange(3.0, dtype=FLOAT).tobytes())
     content[middle] ^= 1
     path.write_bytes({"truncated": content[:200], "flipped": content, "empty": b"", "text": b"hello"}[damage])
     with pytest.raises(ValueError, match=r"c\.npz is not a readable checkpoint"):
@@ -276,5 +278,5 @@ def test_checkpoint_of_another_configuration_is_refused(tmp_path):
     checkpoint.save(tmp_path / "c.npz", tree())
     with pytest.raises(ValueError, match="another configuration"):
         checkpoint.load(tmp_path / "c.npz", {"a": jnp.zeros(3)})
-    with pytest.raises(ValueError, match=r"float32\(3,\), expected float32\(4,\)"):
+    with pytest.raises(ValueError, match=rf"{FLOAT}\(3,\), expected {FLOAT}\(4,\)"):
         checkpoint.load(tmp_path / "c.npz", tree() | {"a": jnp.zeros(4)})

@@ -6,6 +6,7 @@ import pytest
 
 from jaxouter.training.devices import Fleet
 from jaxouter.training.trainer import DIAGNOSIS, EPISODES, FIELDS, build
+from tests.precision import X64, makes_nan
 from tests.training.small import small
 
 SMALL = small(replay=640)  # full after the prefill
@@ -55,11 +56,13 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
     obs, action, reward, terminated, truncated, final = (np.asarray(jnp.stack(x)) for x in zip(*seen, strict=True))
     gamma = trainer.config.ddpg.discount
 
-    bits = jax.random.bits(jax.random.key(0), (trainer.config.ddpg.batch_size, 2))
+    bits = jax.random.bits(jax.random.key(0), (trainer.config.ddpg.batch_size, 2), jnp.uint32)
     batch = trainer.batch(state.replay, bits)
     rows, _ = trainer.replay.sample(state.replay, bits)
     for i, row in enumerate(np.asarray(rows)):
-        match = np.argwhere(np.isclose(action, row[trainer.replay.lead, FIELDS.index("action")], rtol=0, atol=0))
+        match = np.argwhere(
+            np.isclose(np.float32(action), row[trainer.replay.lead, FIELDS.index("action")], rtol=0, atol=0)
+        )
         t, e = match[0]
         total, k = reward[t, e], 0
         while k < n_step - 1 and not (terminated | truncated)[t + k, e]:
@@ -118,6 +121,7 @@ def test_vmapped_seeds_equal_single_runs():
         chex.assert_trees_all_close(lane, one.learner, atol=1e-4)
 
 
+@pytest.mark.skipif(X64, reason="the replay is single precision, for a learner that is")
 def test_compiled_epoch_copies_no_replay_inside_its_loop(filled):
     _, params, state = filled
     fleet = Fleet.of(SMALL)
@@ -158,6 +162,7 @@ def test_a_plant_that_diverges_never_poisons_the_replay():
     chex.assert_tree_all_finite((state.replay.rows, state.learner, state.obs, metrics))
 
 
+@makes_nan
 def test_actions_that_are_not_finite_become_zero_and_are_counted():
     trainer, params = build(small())
     state = trainer.prefill(trainer.start(0, params), params)
