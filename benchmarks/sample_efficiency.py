@@ -103,7 +103,7 @@ def draw(path: Path, found: dict[str, Curve], levels: dict[str, float], title: s
         )
     for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=True):
         axes.axhline(value, color=figures.INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
-    axes.set_xscale("log")
+    figures.log_axis(axes, "x")
     figures.log_axis(axes, "y")
     axes.set_xlabel("control steps of the plant")
     axes.set_ylabel(f"MAE [{unit}]")

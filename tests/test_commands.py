@@ -18,6 +18,7 @@ from jaxouter.plants import REGISTRY
 from jaxouter.training.config import to_dict
 from jaxouter.training.run import Run
 from tests import lag
+from tests.precision import of_single_draws
 from tests.training.small import small
 
 SMALL = ["--steps", "1600", "--prefill", "640", "--epoch", "480", "--environments", "8", "--replay", "1600"]
@@ -59,6 +60,7 @@ def test_train_writes_the_run_folder(trained):
     assert summary["places"] == {"heaters/paper-4": "inside", "heaters/paper-1000": "inside"}
 
 
+@of_single_draws
 def test_train_ends_with_the_table_and_the_main_figure(trained):
     done, folder = trained
     for text in (

@@ -23,6 +23,7 @@ from jaxouter.loop import sensor
 from jaxouter.loop.environment import Environment
 from jaxouter.loop.references import Reaimed
 from tests import lag
+from tests.precision import makes_nan
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +70,7 @@ def test_it_is_the_functional_environment() -> None:
     for action in actions:
         key, key_step = jax.random.split(key)
         r_tilde = 20.0 + 20.0 * action
-        obs, state, reward, *_, expected = step_env(key_step, state, jnp.asarray(r_tilde), params)
+        obs, state, reward, *_, expected = step_env(key_step, state, jnp.asarray(r_tilde, float), params)
         seen, seen_reward, terminated, truncated, info = adapter.step(act(action))
         np.testing.assert_allclose(seen, obs, rtol=1e-4, atol=1e-5)
         assert seen_reward == pytest.approx(float(reward), rel=1e-4, abs=1e-5)
@@ -126,6 +127,7 @@ def test_unit_of_the_plant_by_a_wrapper() -> None:
     assert env.step(act(-7.0))[4]["r_tilde"] == -4.0
 
 
+@makes_nan
 def test_instances_share_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     traced = []
     step_env = Environment.step_env

@@ -18,6 +18,7 @@ from jaxouter.loop.policy import none
 from jaxouter.plants import REGISTRY
 from jaxouter.training.run import Run, write_json
 from tests import lag
+from tests.precision import makes_nan
 from tests.training.small import small
 
 LEARNED = [Contender("learned", "learned", "runs/a", seed) for seed in (1, 0)]
@@ -333,6 +334,7 @@ def test_users_policy_that_fails_is_named(own, name, text):
     assert str(error.value).startswith(text)
 
 
+@makes_nan
 def test_users_policy_whose_arithmetic_fails_has_diverged(own):
     done = board.run(Job("meet", own("GivesUp"), "lag", "lag/steps"))
     assert done.found.settings["diverged"] is True

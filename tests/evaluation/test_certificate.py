@@ -24,6 +24,7 @@ from jaxouter.plants.heaters import HEATERS
 from jaxouter.plants.pitch import PITCH, W_PRINTED
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from tests import lag
+from tests.precision import of_single_draws
 
 KEY = jax.random.key(0)
 W_NOMINAL = (0.1, 0.003, -0.003)
@@ -205,6 +206,7 @@ def test_pi_on_lag_is_exact(kp: float, ki: float, stable: bool) -> None:
     assert certificate.y == pytest.approx(0.5, abs=1e-9)
 
 
+@of_single_draws
 def test_learned_policy_returns_as_fast_as_certified() -> None:
     plant, params = lag.make(d=0.1)
     observer = Observer.of(plant, history=3)

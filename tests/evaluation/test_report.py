@@ -15,6 +15,7 @@ from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop import identify
 from jaxouter.plants import make
 from jaxouter.training.run import surroundings
+from tests.precision import makes_nan
 
 HOSTILE = "<script>alert(1)</script> $x_$.py"
 SCENARIOS = ("pitch/paper", "pitch/steps")
@@ -219,6 +220,7 @@ def test_page_is_one_file_in_both_colour_schemes(chromium, written):
     assert inks[0] != inks[1]
 
 
+@makes_nan
 def test_answer_says_who_is_best_and_how_far_from_the_limit(written):
     said = report.answer(written.comparison)
     assert said.startswith(f"{HOSTILE} is the best on the whole: the lowest MAE within the limits in 2 of 2 scenarios")

@@ -10,6 +10,7 @@ from jaxouter.evaluation.metrics import figures_of_merit
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop import sensor
 from jaxouter.loop.policy import none
+from tests.precision import FLOAT
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Failing:
 @pytest.mark.parametrize("identifier", ["pitch/noise", "heaters/load"])
 def test_host_policy_meets_the_same_episodes(identifier):
     scenario = scenarios.get(identifier, 2)
-    jitted, host = (rollout(Integrator(host), np.float32(0.02), scenario) for host in (False, True))
+    jitted, host = (rollout(Integrator(host), FLOAT.type(0.02), scenario) for host in (False, True))
     for name in ("y0", "y", "r_tilde", "reward"):
         np.testing.assert_allclose(getattr(host, name), getattr(jitted, name), rtol=1e-4, atol=1e-3)
 
@@ -88,7 +89,7 @@ def test_random_policy_gets_another_key_at_each_step():
 @pytest.mark.parametrize("host", [False, True])
 def test_parameters_may_differ_from_episode_to_episode(host):
     scenario = scenarios.get("pitch/noise", 3)
-    gains = np.array([0.0, 0.01, 0.02], np.float32)
+    gains = np.array([0.0, 0.01, 0.02], FLOAT)
     traces = rollout(Integrator(host), gains, scenario, per_episode=True)
     for i, gain in enumerate(gains):
         alone = rollout(Integrator(), gain, scenario)
@@ -122,7 +123,7 @@ def test_sensor_may_differ_from_episode_to_episode():
     scenario = scenarios.get("pitch/noise", 2)
     mixed = replace(scenario, sensor=scenario.sensor.replace(noise=jnp.array([0.0, 0.2])))
     clean = replace(scenario, sensor=sensor.params())
-    a, noisy, calm = (rollout(Integrator(), np.float32(0.02), s).y for s in (mixed, scenario, clean))
+    a, noisy, calm = (rollout(Integrator(), FLOAT.type(0.02), s).y for s in (mixed, scenario, clean))
     np.testing.assert_allclose(a, [calm[0], noisy[1]], rtol=1e-5, atol=1e-5)
     assert np.abs(calm[1] - noisy[1]).max() > 1e-3
 

@@ -7,6 +7,7 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop.policy import none
+from tests.precision import of_single_draws
 
 PITCH = "paper delay-0.57 delay-5.7 delay-swapped uncertainty load noise steps staircase ramps sines doublets"
 HEATERS = "paper-4 paper-1000 riccati cold mixed-stock load noise steps staircase ramps days"
@@ -33,6 +34,7 @@ def test_inner_loop_alone_has_the_specified_mae_on_pitch(identifier, expected):
 
 
 @pytest.mark.parametrize(("identifier", "expected"), [("heaters/paper-4", 15.6), ("heaters/paper-1000", 15.07)])
+@of_single_draws
 def test_inner_loop_alone_has_the_specified_mae_on_heaters(identifier, expected):
     scenario = scenarios.get(identifier)
     traces = rollout(*none(scenario.plant), scenario)

@@ -18,6 +18,7 @@ from jaxouter.agents.ddpg import DDPG, Batch, DDPGConfig
 from jaxouter.train import parse
 from jaxouter.training.devices import Processes
 from jaxouter.training.run import Run
+from tests.precision import of_single_draws
 from tests.training.small import small
 
 HERE = Path(__file__).parent
@@ -26,6 +27,7 @@ OPTIONS += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", 
 OPTIONS += ["--pretraining.gradient-steps", "0"]
 
 
+@of_single_draws
 def test_on_four_forced_devices():
     """The tests in `four_devices.py`, in a process that has them."""
     done = subprocess.run(
@@ -115,6 +117,7 @@ def pair() -> list[list[str]]:
 
 
 @pytest.mark.timeout(500)
+@of_single_draws
 def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
     """50 updates; the two processes are stopped through the second one, and resumed."""
     train = ["heaters", *OPTIONS, "--devices", "2", "--out"]

@@ -74,11 +74,11 @@ def plan(scenario: Scenario) -> Plan:
     episodes, steps = scenario.r.shape
     low, high = scenario.plant.r_tilde_bounds
     base = (low + high) / 2
-    r_tilde = np.full((episodes, steps), base, np.float32)
+    r_tilde = np.full((episodes, steps), base, scenario.r.dtype)
     mae, violation = np.full((2, episodes), np.nan)
 
     free = rollout(Replay(), r_tilde, scenario, per_episode=True)
-    probe = np.random.default_rng(0).uniform(low, high, steps).astype(np.float32)
+    probe = np.random.default_rng(0).uniform(low, high, steps).astype(scenario.r.dtype)
     moved = rollout(Replay(), np.tile(probe, (episodes, 1)), scenario, per_episode=True).y.astype(float) - free.y
     finite = np.isfinite(moved).all(1)
     responses, which = _responses(scenario, probe - base, moved, np.abs(free.y).max(1), finite)

@@ -12,6 +12,7 @@ from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import identify
 from jaxouter.loop.policy import none
 from tests import lag
+from tests.precision import FLOAT, makes_nan
 
 K, T, DEAD_STEPS = 0.5, 0.3, 2
 
@@ -60,7 +61,7 @@ def test_no_other_policy_is_below_it_on_any_episode(on_lag):
     rng = np.random.default_rng(0)
     for spread in (0.1, 1.0, 8.0):
         r_tilde = np.clip(on_lag.plan.r_tilde + rng.normal(0, spread, on_lag.plan.r_tilde.shape), -4, 4)
-        noisy = on_lag.plan._replace(r_tilde=r_tilde.astype(np.float32))
+        noisy = on_lag.plan._replace(r_tilde=r_tilde.astype(FLOAT))
         assert (mae(replayed(scenario, noisy)) >= on_lag.plan.mae - 1e-6).all()
 
 
@@ -81,7 +82,7 @@ def test_simulated_plan_has_the_optimum_and_keeps_the_limits(identifier, episode
     np.testing.assert_allclose(mae(traces), planned.mae, rtol=1e-3)
     assert low < planned.mae.mean() < high
     np.testing.assert_array_equal(planned.violation, 0.0)
-    assert planned.r_tilde.dtype == np.float32
+    assert planned.r_tilde.dtype == FLOAT
     bounds = scenario.plant.r_tilde_bounds
     assert bounds[0] - 1e-5 <= planned.r_tilde.min() <= planned.r_tilde.max() <= bounds[1] + 1e-5
     change = np.diff(traces.y, prepend=traces.y0[:, None], axis=1)
@@ -120,6 +121,7 @@ def test_plant_that_is_not_affine_is_refused():
         plan(lag_scenario(replace(lag.LAG, step=cubic)))
 
 
+@makes_nan
 def test_output_that_is_not_finite_has_no_bound():
     scenario = lag_scenario()
     scenario = replace(scenario, params=scenario.params.replace(K=scenario.params.K.at[1].set(jnp.nan)))

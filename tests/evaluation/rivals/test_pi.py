@@ -16,6 +16,7 @@ from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop import identify
 from jaxouter.loop.policy import AffineParams
 from tests import lag
+from tests.precision import of_single_draws
 
 KEY = jax.random.key(0)
 BUDGET = 25_600
@@ -71,6 +72,7 @@ def test_integral_stands_still_only_where_it_would_drive_further_beyond_a_bound(
     np.testing.assert_allclose(r_tilde, side * np.array([1.0, 1.0, 1.0, 1.0, 0.5]), atol=1e-6)
 
 
+@of_single_draws
 def test_tuned_beats_the_static_prefilter_and_twice_the_budget_is_worth_little(tuned):
     plant, params = lag.make()
     twice = pi.tune(plant, params, KEY, 2 * BUDGET, lambda text: None)

@@ -11,6 +11,7 @@ from jaxouter.evaluation.rivals.tuning import coordinate_search, score, training
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop.policy import Affine, AffineParams, none
 from tests import lag
+from tests.precision import makes_nan
 
 KEY = jax.random.key(0)
 PLANT = replace(lag.RANDOMISED, setpoint_range=(-1.0, 3.0))
@@ -66,6 +67,7 @@ def test_start_and_parameters_are_those_of_training(episodes):
     assert float(episodes.sensor.noise) == 0.0
 
 
+@makes_nan
 def test_score_is_the_mean_return_and_minus_infinity_where_it_diverges(episodes):
     policy, params = none(PLANT)
     assert score(policy, params, episodes) == pytest.approx(rollout(policy, params, episodes).reward.sum(1).mean())
