@@ -114,8 +114,10 @@ def draw(path: Path, found: dict[str, Curve], levels: dict[str, float], title: s
 
 def spread(steps: Sequence[int | None], none: str = "never") -> str:
     """Median of the seeds, least and greatest."""
-    ordered = sorted(steps, key=lambda s: np.inf if s is None else s)
-    low, middle, high = (none if s is None else f"{s:,}" for s in (ordered[0], ordered[len(ordered) // 2], ordered[-1]))
+    all_steps = [np.inf if step is None else step for step in steps]
+    low, middle, high = (
+        f"{step:,.0f}" if np.isfinite(step) else none for step in (min(all_steps), np.median(all_steps), max(all_steps))
+    )
     return middle if low == high else f"{middle} ({low} to {high})"
 
 

@@ -8,7 +8,7 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -95,15 +95,14 @@ def main(arguments: list[str] | None = None) -> None:
             return cli.print_lists()
         cli.use_compilation_cache()
         config = options.config.check()
-        planned = plan(config)
         if options.dry_run:
             print(json.dumps(to_dict(config), indent=2))
-            return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], planned.lines)
-        planned.check()
+            return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], plan(config).lines)
         if options.tensorboard:
             tensorboard.require()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
         devices.connect(config.devices, processes.check(config.devices))
+        plan(config).check()
         Fleet.of(config)  # what is left of the checks, before anything is written
         path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
         run = Run(Path(path), config)
@@ -142,8 +141,8 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
         traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
         return {"mae": mae(traces)}
 
-    with cli.Interrupt() as interrupt, cli.TrainingProgress(config, trainer.env.plant.y_unit) as progress:
-        events = tensorboard.Events(run)
+    bars = cli.TrainingProgress(config, trainer.env.plant.y_unit)
+    with cli.Interrupt() as interrupt, bars as progress, closing(tensorboard.Events(run)) as events:
 
         def heard(seed: int, row: Row) -> None:
             progress(seed, row)
@@ -151,7 +150,6 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
                 events(seed, row)
 
         finals = train(run, watch, heard, lambda: interrupt.requested, progress.pretrained)
-        events.close()
     devices.part()
     return finals
 

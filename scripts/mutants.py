@@ -86,8 +86,8 @@ MUTANTS = (
 )  # fmt: skip
 
 
-def noticed(mutant: Mutant) -> str | None:
-    """The first test that fails with it; None: none does.
+def failing(mutant: Mutant, broken: bool = True) -> str | None:
+    """The first test that fails with it, or without the change; None: none does.
 
     Raises:
         RuntimeError: the code that it breaks is not there, or not there once.
@@ -104,7 +104,7 @@ def noticed(mutant: Mutant) -> str | None:
             raise RuntimeError(
                 f"{mutant.file} has {mutant.code!r} {text.count(mutant.code)} times; it must be there once"
             )
-        path.write_text(text.replace(mutant.code, mutant.broken))
+        path.write_text(text.replace(mutant.code, mutant.broken if broken else mutant.code))
         command = [sys.executable, "-m", "pytest", "-x", "--no-header", "-p", "no:cacheprovider", mutant.tests]
         done = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     failed = [line.split(" ")[1] for line in done.stdout.splitlines() if line.startswith("FAILED ")]
@@ -117,7 +117,9 @@ def main(out: Path = RESULTS) -> None:
     """Break each place in turn, and write what noticed it."""
     rows = []
     for mutant in MUTANTS:
-        test = noticed(mutant)
+        if already := failing(mutant, broken=False):
+            raise RuntimeError(f"{already} fails without any change")
+        test = failing(mutant)
         rows.append((mutant.what, f"`{mutant.file}`", "nothing" if test is None else f"`{test}`"))
         print(" | ".join(rows[-1]), flush=True)
     lines = [

@@ -136,6 +136,11 @@ def descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, 
     return optax.apply_updates(params, step), state
 
 
+def where(condition: jax.Array, tree: Any, other: Any) -> Any:
+    """Leaf by leaf the one or the other."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree, other)
+
+
 @dataclass(frozen=True)
 class DDPG:
     """The learner for observations of `obs_size` numbers. Static and hashable; its state is a pytree."""
@@ -159,11 +164,10 @@ class DDPG:
         return Critic(self.config.hidden, self.config.layer_norm)
 
     def _average(self, found: tuple[jax.Array, Any]) -> tuple[jax.Array, Any, jax.Array]:
-        """Loss and gradient over all parts of the batch, zero where the loss is not finite, and whether it is."""
+        """Over all parts of the batch: loss, zero where it is not finite, gradient, and whether the loss is finite."""
         loss, gradient = found if self.axis is None else jax.lax.pmean(found, self.axis)
         finite = jnp.isfinite(loss)
-        loss, gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.zeros_like(leaf)), (loss, gradient))
-        return loss, gradient, finite
+        return jnp.where(finite, loss, 0.0), gradient, finite
 
     def _rate(self, rate: float) -> float | optax.Schedule:
         decays = self.config.rate_decay == "cosine"
@@ -230,8 +234,8 @@ class DDPG:
 
         Returns:
             The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99) and skipped: 1
-            where a loss is not finite, which then counts as zero and has no gradient. With `norms` also
-            critic_gradient and actor_gradient.
+            where a loss is not finite: what it would have moved, and the targets, stay, and it counts as zero. With
+            `norms` also critic_gradient and actor_gradient.
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
@@ -250,7 +254,10 @@ class DDPG:
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
         critic_value, gradient, critic_finite = self._average((critic_value, gradient))
         of_critics = optax.tree.norm(gradient) if norms else None
-        critics, critic_optimiser = descend(self.critic_optimiser, gradient, state.critic_optimiser, state.critics)
+        before = state.critics, state.critic_optimiser
+        critics, critic_optimiser = where(
+            critic_finite, descend(self.critic_optimiser, gradient, before[1], before[0]), before
+        )
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
         def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[Any, ...]]:
@@ -263,13 +270,15 @@ class DDPG:
 
             (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
             loss, gradient, finite = self._average((loss, gradient))
+            finite &= critic_finite
             actor, optimiser = descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
-            state = state._replace(
+            moved = state._replace(
                 actor=actor,
                 actor_optimiser=optimiser,
                 target_actor=optax.incremental_update(actor, state.target_actor, cfg.polyak),
                 target_critics=optax.incremental_update(state.critics, state.target_critics, cfg.polyak),
             )
+            state = where(finite, moved, state)
             return state, (loss, saturation, finite, optax.tree.norm(gradient) if norms else None)
 
         if cfg.policy_delay == 1:

@@ -90,11 +90,10 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
         raise ValueError(f"{path} belongs to another configuration: {sorted(set(wanted) ^ set(arrays))[0]} differs")
     leaves = []
     for name, leaf in wanted.items():
-        array = jnp.asarray(arrays[name])
-        array = jax.random.wrap_key_data(array) if _is_key(leaf) else array
-        if array.shape != leaf.shape or array.dtype != leaf.dtype:
-            raise ValueError(f"{path}: {name} is {array.dtype}{array.shape}, expected {leaf.dtype}{leaf.shape}")
-        leaves.append(array)
+        array, stored = arrays[name], jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+        if array.shape != stored.shape or array.dtype != stored.dtype:
+            raise ValueError(f"{path}: {name} is {array.dtype}{array.shape}, expected {stored.dtype}{stored.shape}")
+        leaves.append(jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(leaf) else jnp.asarray(array))
     return jax.tree.unflatten(jax.tree.structure(like), leaves), header
 
 
@@ -120,6 +119,13 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     # Without a checksum to stop them, any bytes reach zipfile and NumPy, which answer with more than they document.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
-    except (NotImplementedError, RuntimeError, AttributeError, TypeError, OverflowError, MemoryError) as error:
+    except (
+        NotImplementedError,
+        RuntimeError,
+        AttributeError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+    ) as error:
         raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
     return header, arrays

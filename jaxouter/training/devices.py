@@ -148,22 +148,32 @@ def text_from_first(make: Callable[[], str]) -> str:
     """What `make` gives in the first process, in all of them; it is called there alone.
 
     Raises:
-        ValueError: as `make` does, in all of them.
+        ValueError, OSError: as `make` does, in all of them.
     """
     if jax.process_count() == 1:
         return make()
-    text, failed = "", False
+    text, failed = "", 0
     if is_first():
         try:
             text = make()
-        except ValueError as error:
-            text, failed = str(error), True
+        except (ValueError, OSError) as error:
+            text, failed = str(error), 1 if isinstance(error, ValueError) else 2
     content = np.frombuffer(text.encode(), np.uint8)
     size, failed = multihost_utils.broadcast_one_to_all((np.int32(content.size), np.int32(failed)))
     text = bytes(multihost_utils.broadcast_one_to_all(np.resize(content, int(size)))).decode()
     if failed:
-        raise ValueError(text)
+        raise ValueError(text) if failed == 1 else OSError(text)
     return text
+
+
+def in_first(act: Callable[[], None]) -> None:
+    """Do it in the first process alone; where it fails, all do, as `text_from_first`."""
+
+    def text() -> str:
+        act()
+        return ""
+
+    text_from_first(text)
 
 
 def state_from_first(make: Callable[[], TrainState], like: TrainState) -> TrainState:

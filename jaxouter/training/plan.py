@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +28,7 @@ class Plan(NamedTuple):
 
     def check(self) -> None:
         """Raises ValueError where the machine has less memory."""
-        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        there = _there()
         if self.memory > there:
             raise ValueError(
                 f"this run needs about {_bytes(self.memory)} of memory and the machine has {_bytes(there)}; take fewer "
@@ -68,7 +70,10 @@ def plan(config: TrainConfig) -> Plan:
     lines.append(
         ("arithmetic, updates", f"{flop / 1e6:,.0f} MFLOP each, {flop * config.total_updates:.2g} FLOP a seed")
     )
-    memory = (config.seeds + 1) * whole  # one more on its way to the disk
+    here = -(-config.seeds // jax.process_count())
+    # Bits by which the batches of an epoch are drawn, twice.
+    drawn = 16 * config.epoch // config.environments * config.updates * config.ddpg.batch_size
+    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more on its way to the disk
     if start.gradient_steps:
         steps = start.episode_steps or trainer.env.plant.episode_steps
         lags = start.lags or observer.history
@@ -85,6 +90,15 @@ def plan(config: TrainConfig) -> Plan:
         ]
     lines.append((f"memory in all, {config.seeds} seeds, about", _bytes(memory)))
     return Plan(lines, memory)
+
+
+def _there() -> int:
+    """Bytes of memory of the machine, or of the container where that has less."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):  # there is none, or it is "max"
+            limits.append(int(Path(path).read_text()))
+    return min(limits)
 
 
 def update_mflop(config: DDPGConfig, observations: int) -> int:

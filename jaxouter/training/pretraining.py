@@ -250,7 +250,8 @@ def rehearse(
         chunk, school = rates[done : done + CHUNK], schools[done >= longer]
         carry, reward = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
         reward = np.asarray(reward)[:, 0]
-        best, reached = reward[0] if done == longer else max(float(at.best), reward[0]), reward[-LAST:].mean()
+        first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
+        best = first if done == longer else max(float(at.best), first)
         then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative
             at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), then)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -10,7 +11,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -55,10 +56,10 @@ class Run:
             [out] if out is not None else [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))]
         )
         for path in candidates:
-            if path.exists():
-                continue
             made = None
             try:
+                if path.exists():
+                    continue
                 path.parent.mkdir(parents=True, exist_ok=True)
                 made = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
                 run = cls(made, config)
@@ -70,7 +71,7 @@ class Run:
             except OSError as error:
                 if made is not None:
                     shutil.rmtree(made, ignore_errors=True)
-                if path.exists():  # made by another process meanwhile
+                if error.errno == errno.ENOTEMPTY:  # made by another process meanwhile
                     continue
                 raise ValueError(f"the folder {path} can't be made: {error.strerror}") from None
             return cls(path, config)
@@ -85,7 +86,7 @@ class Run:
         """
         try:
             content = json.loads((path / "config.json").read_text())
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             raise ValueError(f"{path} is not a run folder: it has no readable config.json") from None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{path}/config.json is not of format {FORMAT}, the one that this version reads")
@@ -101,17 +102,22 @@ class Run:
         Raises:
             ValueError: another process has it.
         """
-        with (self.path / "lock").open("a+") as file:
+        with ExitStack() as stack:
+            path = self.path / "lock"
             try:
+                file = stack.enter_context(path.open("a+"))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                file.seek(0)
+                number = path.read_text().strip()
                 raise ValueError(
-                    f"{self.path} is being trained by process {file.read().strip()}; wait for its end, or stop it"
+                    f"{self.path} is being trained by process {number}; wait for its end, or stop it"
                 ) from None
-            file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
+            except OSError as error:
+                raise ValueError(f"{self.path} can't be locked: {error.strerror}") from None
+            with suppress(OSError):  # on a full disk the number of the process is not told
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
             yield
 
     def changes(self) -> list[str]:
@@ -188,10 +194,13 @@ class Run:
         Raises:
             OSError: it can't be written; the old ones are there.
         """
-        path = self.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz"
+        path, rows = self.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz", self.seed_folder(seed) / "metrics.jsonl"
+        if rows.exists():
+            with rows.open("rb+") as file:
+                os.fsync(file.fileno())  # before what goes on after them
         checkpoint.save(path, state, seed=seed, epoch=epoch)
-        for old in [*list(self.checkpoints(seed).values())[:-KEEP], self._rehearsal(seed)]:
-            old.unlink(missing_ok=True)
+        for old in list(self.checkpoints(seed).values())[:-KEEP]:
+            old.unlink()
 
     def load(self, seed: int, epoch: int | None = None) -> tuple[TrainState, int]:
         """State and number of epochs of the checkpoint after so many epochs; None: the newest that is whole.
@@ -230,13 +239,24 @@ class Run:
             warnings.warn(f"{error}; the pretraining begins anew", DamagedWarning, stacklevel=2)
             return None
 
+    def forget_rehearsals(self) -> None:
+        """Drop what was kept of the pretraining."""
+        for seed in self.seeds:
+            self._rehearsal(seed).unlink(missing_ok=True)
+
     def _rehearsal(self, seed: int) -> Path:
         return self.seed_folder(seed) / "pretraining.npz"
 
     def median_seed(self) -> int:
         """The seed with the median MAE on the first of the paper's scenarios; before there is a summary the first."""
         path = self.path / "summary.json"
-        return json.loads(path.read_text())["median_seed"] if path.exists() else self.config.seed
+        if not path.exists():
+            return self.config.seed
+        try:
+            return self.seeds[self.seeds.index(json.loads(path.read_text())["median_seed"])]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            seeds = ", ".join(map(str, self.seeds))
+            raise ValueError(f"{path} is damaged: it names no median seed of {seeds}") from None
 
     def rows(self, seed: int) -> list[dict[str, Any]]:
         """Rows of metrics.jsonl, one an epoch; a last one that was not written to its end is none.
@@ -247,9 +267,12 @@ class Run:
         path = self.seed_folder(seed) / "metrics.jsonl"
         lines = path.read_text().split("\n")[:-1] if path.exists() else []
         try:
-            return [json.loads(line) for line in lines]
-        except ValueError as error:
+            rows = [json.loads(line) for line in lines]
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path} is damaged: {error}") from None
+        if not all(isinstance(row, dict) and {"epoch", "steps", "seconds"} <= set(row) for row in rows):
+            raise ValueError(f"{path} is damaged: a row has no epoch, steps or seconds")
+        return rows
 
     def append(self, seed: int, row: dict[str, Any]) -> None:
         """One row more."""

@@ -2,48 +2,55 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
 from jaxouter.training.run import Run
 
 
-def require() -> Any:
-    """The writer's class.
-
-    Raises:
-        ValueError: tensorboardX is not installed.
-    """
+def require() -> None:
+    """Raises ValueError where tensorboardX is not installed."""
     try:
-        from tensorboardX import SummaryWriter
+        import tensorboardX  # noqa: F401
     except ImportError:
         raise ValueError('--tensorboard needs tensorboardX: pip install "jaxouter[tensorboard]"') from None
-    return SummaryWriter
 
 
 class Events:
-    """Writes each row of a run as it comes, into the folder of its seed."""
+    """Writes each row of a run as it comes, into the folder of its seed, without a thread that could fail unheard."""
 
     def __init__(self, run: Run) -> None:
         self._run, self._writers = run, {}
 
     def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
-        """One row, over its environment steps; with the first one all that the run has, so that none is there twice."""
+        """One row, over its environment steps; with the first one all that the run has, so that none is there twice.
+
+        Raises:
+            OSError: it can't be written.
+        """
+        from tensorboardX.event_file_writer import EventsWriter
+
         if self._writers:
             return self._write(seed, row)
         for each in self._run.seeds:
             folder = self._run.seed_folder(each)
             for old in folder.glob("events.out.tfevents.*"):
                 old.unlink()
-            self._writers[each] = require()(str(folder), flush_secs=5)
+            self._writers[each] = EventsWriter(str(folder / "events"))
             for known in self._run.rows(each):
                 self._write(each, known)
 
     def _write(self, seed: int, row: Mapping[str, Any]) -> None:
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+        from tensorboardX.summary import scalar
+
         for name, value in row.items():
-            self._writers[seed].add_scalar(name, value, row["steps"])
+            event = Event(wall_time=time.time(), step=row["steps"], summary=scalar(name, value))
+            self._writers[seed].write_event(event)
+        self._writers[seed].flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Close the files."""
         for writer in self._writers.values():
             writer.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -98,22 +99,29 @@ def train(
 
     def every_seed() -> Iterator[tuple[int, TrainState]]:
         for seeds in rounds:
-            taken = zip(seeds, fleet.take(states[seeds]), strict=True)
-            yield from taken if devices.is_first() else ()
+            yield from zip(seeds, fleet.take(states[seeds]), strict=True)
 
     def save(epoch: int) -> None:
         for seed, state in every_seed():
-            run.save(seed, epoch, state)
+            devices.in_first(partial(run.save, seed, epoch, state))
+        devices.in_first(run.forget_rehearsals)  # now that every seed has a checkpoint
+
+    def keep(seed: int, state: TrainState, epoch: int, metrics: Row, rates: Row) -> None:
+        if epoch == 0 and run.rows(seed):
+            return  # from before a kill
+        row: Row = {"epoch": epoch, "steps": int(state.steps), "updates": int(state.learner.updates), **metrics}
+        if epoch > 0:
+            row |= {name: float(value) for name, value in trainer.diagnose(state, params).items()}
+        row |= on_epoch(trainer, state) | rates
+        run.append(seed, row)
+        report(seed, row)
 
     if cfg.pretraining.gradient_steps and not done:
-        seconds = (time.perf_counter() - begun) / cfg.seeds
+        rates = {"seconds": (time.perf_counter() - begun) / cfg.seeds}
         for seed, state in every_seed():  # what the start gave is the row of epoch 0
             _check(seed, 0, state)
-            row = {"epoch": 0, "steps": int(state.steps), "updates": 0, **on_epoch(trainer, state), "seconds": seconds}
-            if not run.rows(seed):
-                run.append(seed, row)
-                report(seed, row)
-        pace.save(lambda: save(0))
+            devices.in_first(partial(keep, seed, state, 0, {}, rates))
+        pace.save(partial(save, 0))
     for epoch in range(done, cfg.epochs):
         steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
         for seeds in rounds:
@@ -121,26 +129,18 @@ def train(
             states[seeds], metrics = fleet.epoch(states[seeds], params, steps)
             metrics = devices.get(metrics)  # waits for the epoch to end
             seconds = time.perf_counter() - begun
+            rates = {
+                "seconds": seconds,
+                "steps_per_second": steps / seconds,
+                "updates_per_second": steps // cfg.environments * cfg.updates / seconds,
+            }
             for i, (seed, state) in enumerate(zip(seeds, fleet.take(states[seeds]), strict=True)):
-                if not devices.is_first():
-                    continue
                 _check(seed, epoch + 1, state)
-                row: Row = {
-                    "epoch": epoch + 1,
-                    "steps": int(state.steps),
-                    "updates": int(state.learner.updates),
-                    **{name: float(value[i]) for name, value in metrics.items()},
-                    **{name: float(value) for name, value in trainer.diagnose(state, params).items()},
-                    **on_epoch(trainer, state),
-                    "seconds": seconds,
-                    "steps_per_second": steps / seconds,
-                    "updates_per_second": steps // cfg.environments * cfg.updates / seconds,
-                }
-                run.append(seed, row)
-                report(seed, row)
+                found = {name: float(value[i]) for name, value in metrics.items()}
+                devices.in_first(partial(keep, seed, state, epoch + 1, found, rates))
         stopping = devices.any_process(stop())
         if devices.any_process(stopping or epoch + 1 == cfg.epochs or (devices.is_first() and pace.due())):
-            pace.save(lambda epoch=epoch: save(epoch + 1))
+            pace.save(partial(save, epoch + 1))
         if stopping:
             return None
     return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
@@ -157,7 +157,7 @@ def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], 
     """States of some seeds after so many epochs: from their checkpoints, or started and prefilled."""
     trainer, params = run.trainer
     like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
-    kept = [seed for seed in seeds if done in run.checkpoints(seed)] if devices.is_first() else []
+    kept = [seed for seed in seeds if done in run.whole(seed)] if devices.is_first() else []
     loads = devices.any_process(len(kept) == len(seeds))
 
     def whole(seed: int) -> TrainState:

@@ -273,7 +273,9 @@ class Trainer:
         """
         key_batch, key_update, key_run = jax.random.split(jax.random.fold_in(state.key, DIAGNOSIS), 3)
         bits = jax.random.bits(key_batch, (self.config.ddpg.batch_size, 2), jnp.uint32)
-        _, of_batch = self.learner.update(state.learner, self.batch(state.replay, bits), key_update, norms=True)
+        every = self.config.ddpg.policy_delay  # before an update that moves the actor
+        learner = state.learner._replace(updates=jnp.full_like(state.learner.updates, every - 1))
+        _, of_batch = self.learner.update(learner, self.batch(state.replay, bits), key_update, norms=True)
         expected, came = jax.vmap(self._episode, (0, None, None))(jax.random.split(key_run, EPISODES), state, params)
         rows = jnp.minimum(state.replay.written, self.replay.steps).astype(expected.dtype)
         return {name: of_batch[name] for name in ("critic_gradient", "actor_gradient")} | {
@@ -296,8 +298,9 @@ class Trainer:
             obs, env, reward, terminated, _, _ = self.env.step_env(key, env, r_tilde, params)
             return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
 
-        obs, env = self.env.reset(key, params)
-        keys = jax.random.split(key, self.env.plant.episode_steps)
+        key_reset, key_run = jax.random.split(key)
+        obs, env = self.env.reset(key_reset, params)
+        keys = jax.random.split(key_run, self.env.plant.episode_steps)
         (last, _, weight), rewards = jax.lax.scan(step, (obs, env, jnp.ones_like(env.y)), keys)
         return value(obs), self.config.reward_scale * jnp.sum(rewards) + weight * value(last)
 

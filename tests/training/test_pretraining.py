@@ -140,6 +140,16 @@ def test_a_start_that_was_stopped_goes_on_where_it_was(config, tmp_path):
     assert stopped.load_rehearsal(0) is None
 
 
+def test_a_damaged_first_checkpoint_is_made_again(config, tmp_path):
+    run = Run.create(config, tmp_path / "run")
+    finals = train(run)
+    (path,) = run.checkpoints(0).values()
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.warns(DamagedWarning, match=r"checkpoint-000000\.npz is not a readable checkpoint"):
+        resumed = train(Run.open(run.path))
+    chex.assert_trees_all_equal(finals, resumed)
+
+
 def test_a_damaged_start_begins_anew(config, tmp_path):
     run, heard = Run.create(config, tmp_path / "run"), []
     train(run, stop=lambda: True)

@@ -46,7 +46,7 @@ def test_stop_save_and_go_on_equals_an_uninterrupted_run(tmp_path):
 def test_rows_of_an_epoch_that_was_not_saved_are_dropped_on_resumption(tmp_path):
     run = new_run(tmp_path / "run")
     train(run, stop=lambda: True)
-    run.append(0, {"epoch": 2})  # as after a kill between row and checkpoint
+    run.append(0, {"epoch": 2, "steps": 2_560, "seconds": 1.0})  # as after a kill between row and checkpoint
     assert train(run) is not None
     assert [row["epoch"] for row in run.rows(0)] == [1, 2, 3]
 
@@ -154,6 +154,26 @@ def test_a_folder_is_trained_by_one_process_at_a_time(tmp_path):
         pass
     with run.lock():
         pass
+
+
+def test_a_folder_that_cannot_be_locked_or_made_is_refused(tmp_path):
+    run = new_run(tmp_path / "run")
+    (run.path / "lock").mkdir()
+    with pytest.raises(ValueError, match="can't be locked: Is a directory"), run.lock():
+        pass
+    with pytest.raises(ValueError, match="can't be made: File name too long"):
+        new_run(tmp_path / ("x" * 300))
+
+
+@pytest.mark.parametrize("content", ["{}", "[" * 100_000, '{"median_seed": 7}'])
+def test_a_summary_that_is_damaged_is_named(tmp_path, content):
+    run = new_run(tmp_path / "run")
+    (run.path / "summary.json").write_text(content)
+    with pytest.raises(ValueError, match=r"summary\.json is damaged"):
+        run.median_seed()
+    (run.path / "config.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="is not a run folder"):
+        Run.open(run.path)
 
 
 def test_what_changed_since_the_run_was_made_is_listed(tmp_path):

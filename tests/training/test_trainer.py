@@ -188,9 +188,10 @@ def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes():
     gamma, returns = trainer.config.ddpg.discount, []
     step = jax.jit(trainer.env.step_env)
     for of_episode in jax.random.split(key, EPISODES):
-        _, env = trainer.env.reset(of_episode, params)
+        of_reset, of_run = jax.random.split(of_episode)
+        _, env = trainer.env.reset(of_reset, params)
         rewards = []
-        for of_step in jax.random.split(of_episode, trainer.env.plant.episode_steps):
+        for of_step in jax.random.split(of_run, trainer.env.plant.episode_steps):
             _, env, reward, *_ = step(of_step, env, jnp.array(20.0), params)
             rewards.append(float(reward))
         returns.append(0.5 * np.sum(gamma ** np.arange(len(rewards)) * rewards))
