@@ -30,7 +30,7 @@ from jaxouter.training.run import Run, surroundings, write_json
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "soak.json"
 TRAINING = (  # of which a piece as long as a start of the process holds some gradient steps and epochs
-    *("heaters", "--seeds", "2", "--pretraining.gradient-steps", "400", "--pretraining.episodes", "8"),
+    *("heaters", "--pretraining.gradient-steps", "400", "--pretraining.episodes", "8"),
     *(
         "--pretraining.batch-size",
         "16",
@@ -57,15 +57,18 @@ class Options:
     """Of the moments."""
     within: float = 20.0
     """Seconds after a start in which it is killed."""
+    seeds: int = 2
+    """That train side by side."""
     steps: int = 40_640
-    """Environment steps of each of the two seeds."""
+    """Environment steps of each of them."""
     out: Path = RESULTS
     """Where the result goes."""
 
 
-def command(folder: Path, steps: int) -> list[str]:
+def command(folder: Path, options: Options) -> list[str]:
     """Begin the run, or go on with it."""
-    start = ["--resume", str(folder)] if folder.exists() else [*TRAINING, "--steps", str(steps), "--out", str(folder)]
+    size = ["--seeds", str(options.seeds), "--steps", str(options.steps)]
+    start = ["--resume", str(folder)] if folder.exists() else [*TRAINING, *size, "--out", str(folder)]
     return [sys.executable, "-m", "jaxouter.train", *start]
 
 
@@ -87,7 +90,7 @@ def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
     draw, moments = random.Random(options.seed), []
     for i in range(options.kills):
         begun = time.monotonic()
-        process = subprocess.Popen(command(folder, options.steps), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(command(folder, options), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         try:
             process.wait(draw.uniform(0.0, options.within))
         except subprocess.TimeoutExpired:
@@ -97,7 +100,7 @@ def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
             raise RuntimeError(f"it ended by itself with status {process.returncode}: {errors.decode()[-2000:]}")
         moments.append({"seconds": round(time.monotonic() - begun, 2), "found": where(folder)})
         print(f"kill {i + 1} after {moments[-1]['seconds']} s: {moments[-1]['found']}", flush=True)
-    subprocess.run(command(folder, options.steps), check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command(folder, options), check=True, stdout=subprocess.DEVNULL)
     return moments
 
 
@@ -125,14 +128,14 @@ def soak(options: Options) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory() as folder:
         whole, disturbed = Path(folder) / "whole", Path(folder) / "disturbed"
-        subprocess.run(command(whole, options.steps), check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(command(whole, options), check=True, stdout=subprocess.DEVNULL)
         moments = killed(disturbed, options)
         one, other = Run.open(whole), Run.open(disturbed)
         if found := differences(one, other):
             raise RuntimeError(f"the runs differ in {', '.join(found)}")
         rows = sum(len(one.rows(seed)) for seed in one.seeds)
     about = {"date": date.today().isoformat(), "machine": surroundings(), "command": " ".join(TRAINING)}
-    return about | {"steps": options.steps, "rows": rows, "kills": moments, "differences": []}
+    return about | {"seeds": options.seeds, "steps": options.steps, "rows": rows, "kills": moments, "differences": []}
 
 
 def main(options: Options) -> None:

@@ -125,6 +125,7 @@ def test_copies_of_one_house_without_noise_are_that_house(seed, n):
     near(temperatures(r_tilde, n, **copies), np.repeat(temperatures(r_tilde, 1, **house), n))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pitch", "heaters"])
 def test_a_million_random_steps_stay_finite(name):
     plant, params = make(name)

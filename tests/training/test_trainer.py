@@ -98,8 +98,9 @@ def test_epochs_of_one_length_are_compiled_once(filled):
     assert trainer.epoch._cache_size() == before
 
 
-def test_same_seed_twice_is_bit_equal_and_another_seed_is_not():
-    trainer, params = build(small())
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_same_seed_twice_is_bit_equal_and_another_seed_is_not(name):
+    trainer, params = build(small(name=name))
     first, second, other = (
         trainer.epoch(trainer.prefill(trainer.start(seed, params), params), params, 80)[0] for seed in (0, 0, 1)
     )
@@ -108,6 +109,7 @@ def test_same_seed_twice_is_bit_equal_and_another_seed_is_not():
     assert not np.array_equal(jax.tree.leaves(first.learner.actor)[0], jax.tree.leaves(other.learner.actor)[0])
 
 
+@pytest.mark.slow
 def test_vmapped_seeds_equal_single_runs():
     trainer, params = build(small())
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
