@@ -55,11 +55,11 @@ class Options:
     """How often."""
     seed: int = 0
     """Of the moments."""
-    within: float = 20.0
+    within: float = 8.0
     """Seconds after a start in which it is killed."""
     seeds: int = 2
     """That train side by side."""
-    steps: int = 40_640
+    steps: int = 400_640
     """Environment steps of each of them."""
     out: Path = RESULTS
     """Where the result goes."""
@@ -97,7 +97,9 @@ def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
             process.send_signal(signal.SIGKILL)
         _, errors = process.communicate()
         if process.returncode != -signal.SIGKILL:
-            raise RuntimeError(f"it ended by itself with status {process.returncode}: {errors.decode()[-2000:]}")
+            raise RuntimeError(
+                f"it ended by itself with status {process.returncode} (0: take more steps): {errors.decode()[-2000:]}"
+            )
         moments.append({"seconds": round(time.monotonic() - begun, 2), "found": where(folder)})
         print(f"kill {i + 1} after {moments[-1]['seconds']} s: {moments[-1]['found']}", flush=True)
     subprocess.run(command(folder, options), check=True, stdout=subprocess.DEVNULL)

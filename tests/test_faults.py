@@ -40,7 +40,7 @@ def ended(*command: str) -> subprocess.CompletedProcess[str]:
 
 def test_three_kills_change_nothing(tmp_path):
     soak = script("soak")
-    content = soak.soak(soak.Options(kills=3, within=12.0, seeds=1, steps=4_640, out=tmp_path / "soak.json"))
+    content = soak.soak(soak.Options(kills=3, within=8.0, seeds=1, steps=20_640, out=tmp_path / "soak.json"))
     assert len(content["kills"]) == 3
 
 
