@@ -1,7 +1,4 @@
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,20 +6,9 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.training.config import preset
+from tests.load import load
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
-
-
-def load(name):
-    """A script of the benchmarks folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"benchmarks_{name}", FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where its dataclasses look for their annotations
-    spec.loader.exec_module(module)
-    return module
-
-
-cases, slower, throughput = load("cases"), load("slower"), load("throughput")
+cases, slower, throughput = (load("benchmarks", name) for name in ("cases", "slower", "throughput"))
 
 
 def test_an_update_of_the_paper_is_counted_at_157_mflop():

@@ -1,6 +1,5 @@
 """Training runs that are killed, run out of disk, or meet another on the same folder, through the real command."""
 
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -12,19 +11,10 @@ import pytest
 from jaxouter.training import checkpoint
 from jaxouter.training.run import Run
 from jaxouter.training.train import train
+from tests.load import load
 from tests.training.small import small
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 TMPFS = ["unshare", "--user", "--map-root-user", "--mount"]
-
-
-def script(name):
-    """A script of the folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"scripts_{name}", SCRIPTS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where its dataclasses look for their annotations
-    spec.loader.exec_module(module)
-    return module
 
 
 def begun(path: Path) -> Run:
@@ -39,7 +29,7 @@ def ended(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_three_kills_change_nothing(tmp_path):
-    soak = script("soak")
+    soak = load("scripts", "soak")
     content = soak.soak(soak.Options(kills=3, within=8.0, seeds=1, steps=20_640, out=tmp_path / "soak.json"))
     assert len(content["kills"]) == 3
 
