@@ -144,7 +144,7 @@ def main(options: Options) -> None:
     """The command."""
     content = soak(options)
     write_json(options.out, content)
-    print(f"{len(content['kills'])} kills; all parameters and {content['rows']} rows are equal; {options.out}")
+    print(f"{len(content['kills'])} kills; all parameters and {content['rows']} rows are equal")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,18 @@
 #!/usr/bin/env bash
 # Lint, types and tests, those of plants and loop in double precision too; under 12 minutes on 2 cores. With --all, under
 # 80 minutes, also the slow tests, all others in double precision with checks for NaN, places broken on purpose, and 20
-# kills. Other arguments go to pytest, and nothing else is tested then.
+# kills; what came out is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile "$@"; }
 in_double() { JAX_ENABLE_X64=1 tests "$@"; }
+no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
+part() {  # TITLE COMMAND...: run it, and note its last line and its minutes
+    local title=$1 begin=$SECONDS last
+    shift
+    last=$("$@" | tee /dev/stderr | tail -n 1 | tr -d '=' | xargs) || failed=1
+    printf '| %s | %s | %d |\n' "$title" "$last" $(((SECONDS - begin + 59) / 60)) >>"$result"
+}
 
 "$PYTHON" -m ruff format --check .
 "$PYTHON" -m ruff check .
@@ -14,11 +21,15 @@ if [ $# -eq 0 ]; then
     tests
     in_double tests/plants tests/loop
 elif [ "$*" = --all ]; then
-    tests --all
-    in_double --all tests/plants tests/loop
-    JAX_DEBUG_NANS=1 in_double --ignore=tests/plants --ignore=tests/loop tests
-    "$PYTHON" scripts/mutants.py
-    "$PYTHON" scripts/soak.py
+    failed=0 result=benchmarks/results/tests.md
+    printf '`scripts/test.sh --all`, %s, %s CPUs, commit %s\n\n| part | last line | minutes |\n|---|---|---|\n' \
+        "$(date --utc +%F)" "$(nproc)" "$(git describe --always --dirty)" >"$result"
+    part "all tests, the slow ones too" tests --all
+    part "plants and loop, double precision" in_double --all tests/plants tests/loop
+    part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
+    part "places broken on purpose" "$PYTHON" scripts/mutants.py
+    part "20 kills" "$PYTHON" scripts/soak.py
+    exit $failed
 else
     tests "$@"
 fi
