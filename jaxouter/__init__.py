@@ -1,6 +1,18 @@
 """jaxouter learns an outer loop: it sees the reference r and the output y, and chooses the modified reference r~."""
 
-from jaxouter.loop.environment import make
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxouter.loop.environment import make
 
 __all__ = ["__version__", "make"]
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """`make` when it is first used: a controller that was exported imports no JAX."""
+    if name != "make":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from jaxouter.loop.environment import make
+
+    return make

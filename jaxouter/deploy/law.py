@@ -1,0 +1,144 @@
+"""The learned controller as numbers: what every export holds, and the control law in NumPy. Imports no JAX."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxouter.plants import Plant
+    from jaxouter.training.policy import LearnedParams, LearnedPolicy
+
+FORMAT = 1
+
+
+class State(NamedTuple):
+    """What the controller remembers between two control steps; float32."""
+
+    y_past: np.ndarray  # (H,), y_(k-1), y_(k-2), ...
+    r_tilde_past: np.ndarray  # (H,), r~_(k-1), r~_(k-2), ...
+    integral: np.ndarray  # (), leaky integral of r - y
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """r~ = clip(offset + slope r + half the range of r~ times tanh(network(observation))).
+
+    The observation, (3 + 2H,), is that of `jaxouter.loop.observation.Observer`: [r - y_middle, r - y, integral,
+    past y - y] / y_scale, and past r~ in terms of its range.
+    """
+
+    plant: str
+    y_unit: str
+    time_unit: str
+    control_step: float
+    """In `time_unit`."""
+    r_tilde_bounds: tuple[float, float]
+    setpoint_range: tuple[float, float]
+    """Set-points that training had."""
+    y_range: tuple[float, float]
+    """Where y was in training: it ended episodes that left this."""
+    history: int
+    """H, past samples of y and of r~."""
+    integral_steps: float
+    """Time constant of the leaky integral, in control steps."""
+    y_middle: float
+    y_scale: float
+    slope: float
+    offset: float
+    weights: tuple[np.ndarray, ...] = field(repr=False)
+    """Of each layer, (n, m), float32."""
+    biases: tuple[np.ndarray, ...] = field(repr=False)
+    """Of each layer, (m,), float32."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where the layers don't fit together."""
+        widths = [3 + 2 * self.history, *(len(bias) for bias in self.biases)]
+        wanted = list(pairwise(widths))
+        shapes = [weight.shape for weight in self.weights]
+        if shapes != wanted or widths[-1] != 1:
+            raise ValueError(f"the layers have shapes {shapes}; with their biases they must be {wanted}, ending in 1")
+
+    @classmethod
+    def of(cls, policy: LearnedPolicy, params: LearnedParams, plant: Plant) -> Law:
+        """The law of a learned policy on a plant."""
+        layers = params.actor["params"]
+        names = sorted(layers, key=lambda name: int(name.rpartition("_")[2]))
+        observer = policy.observer
+        return cls(
+            plant=plant.name,
+            y_unit=plant.y_unit,
+            time_unit=plant.time_unit,
+            control_step=plant.control_step,
+            r_tilde_bounds=observer.r_tilde_bounds,
+            setpoint_range=plant.setpoint_range,
+            y_range=plant.divergence_bounds,
+            history=observer.history,
+            integral_steps=observer.integral_steps,
+            y_middle=observer.y_middle,
+            y_scale=observer.y_scale,
+            slope=float(params.prior.slope),
+            offset=float(params.prior.offset),
+            weights=tuple(np.asarray(layers[name]["kernel"], np.float32) for name in names),
+            biases=tuple(np.asarray(layers[name]["bias"], np.float32) for name in names),
+        )
+
+    def init(self, y0: float) -> State:
+        """Before the first step: histories filled with y_0, and with r~ = y_0 clipped to its bounds."""
+        y = np.float32(y0)
+        before = np.clip(y, *np.asarray(self.r_tilde_bounds, np.float32))
+        return State(np.full(self.history, y), np.full(self.history, before), np.zeros((), np.float32))
+
+    def act(self, state: State, r: float, y: float) -> tuple[State, np.float32]:
+        """At t_k: the next state, and r~_k."""
+        low, high = self.r_tilde_bounds
+        r_k, y_k = np.float32(r), np.float32(y)
+        integral = np.float32(state.integral + (r_k - y_k - state.integral) / np.float32(self.integral_steps))
+        present = np.array([r_k - self.y_middle, r_k - y_k, integral], np.float32)
+        of_y = np.concatenate([present, state.y_past - y_k]) / np.float32(self.y_scale)
+        of_r_tilde = (state.r_tilde_past - np.float32((low + high) / 2)) / np.float32((high - low) / 2)
+        x = np.concatenate([of_y, of_r_tilde])
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = np.maximum(x @ weight + bias, np.float32(0.0))
+        action = np.tanh(x @ self.weights[-1] + self.biases[-1])[0]
+        r_tilde = np.float32(np.clip(self.offset + self.slope * r_k + (high - low) / 2 * action, low, high))
+        y_past, r_tilde_past = np.roll(state.y_past, 1), np.roll(state.r_tilde_past, 1)
+        y_past[0], r_tilde_past[0] = y_k, r_tilde
+        after = State(y_past, r_tilde_past, np.asarray(integral))
+        return after, r_tilde
+
+    def save(self, path: Path) -> None:
+        """Write an npz file: `header`, JSON of everything but the layers, and `weight_i`, `bias_i` of each layer."""
+        header = {name: value for name, value in asdict(self).items() if name not in ("weights", "biases")}
+        arrays = {f"weight_{i}": weight for i, weight in enumerate(self.weights)}
+        arrays |= {f"bias_{i}": bias for i, bias in enumerate(self.biases)}
+        with path.open("wb") as file:
+            np.savez(file, allow_pickle=False, header=np.asarray(json.dumps({"format": FORMAT} | header)), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Law:
+        """The law in a file that `save` wrote.
+
+        Raises:
+            ValueError: it is no such file, or is damaged.
+        """
+        try:
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+                header: dict[str, Any] = json.loads(str(file["header"]))
+                layers = range(sum(name.startswith("weight_") for name in file.files))
+                weights, biases = (tuple(file[f"{name}_{i}"] for i in layers) for name in ("weight", "bias"))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is not a controller exported as npz: {error}") from None
+        if header.pop("format", None) != FORMAT:
+            raise ValueError(f"{path} is not of format {FORMAT}, the one that this version reads")
+        names = {f.name for f in fields(cls)} - {"weights", "biases"}
+        if set(header) != names:
+            raise ValueError(f"{path} is damaged: its header has fields {sorted(set(header) ^ names)} missing or more")
+        header = {name: tuple(value) if isinstance(value, list) else value for name, value in header.items()}
+        return cls(**header, weights=weights, biases=biases)

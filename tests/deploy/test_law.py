@@ -1,0 +1,67 @@
+"""The control law as numbers against the learned policy."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxouter.deploy.law import Law
+from jaxouter.training.trainer import build
+from tests.training.small import small
+
+
+def learned(plant):
+    """A policy with a random actor that uses its whole range, and its law."""
+    trainer, params = build(small(plant))
+    found = trainer.policy_params(trainer.fresh(jax.random.key(3), params))
+    actor = jax.tree.map(lambda leaf: 3.0 * leaf, found.actor)
+    found = found._replace(actor=actor)
+    return trainer.policy, found, Law.of(trainer.policy, found, trainer.env.plant)
+
+
+@pytest.mark.parametrize("plant", ["pitch", "heaters"])
+def test_it_acts_like_the_policy_in_closed_loop(plant):
+    policy, params, law = learned(plant)
+    low, high = law.r_tilde_bounds
+    rng = np.random.default_rng(0)
+    r, y = rng.uniform(*law.setpoint_range, (2, 200)).astype(np.float32)
+    carry, state, act = policy.init(params, r[0], y[0]), law.init(y[0]), jax.jit(policy.act)
+    seen = []
+    for r_k, y_k in zip(r, y, strict=True):
+        carry, wanted = act(params, carry, jnp.asarray(r_k, float), jnp.asarray(y_k, float))
+        state, r_tilde = law.act(state, r_k, y_k)
+        seen.append((float(wanted), float(r_tilde)))
+    wanted, got = np.transpose(seen)
+    assert np.ptp(wanted) > 0.01 * (high - low)
+    np.testing.assert_allclose(got, wanted, atol=1e-5 * (high - low))
+
+
+def test_a_file_holds_it_all(tmp_path):
+    *_, law = learned("pitch")
+    law.save(tmp_path / "controller.npz")
+    again = Law.load(tmp_path / "controller.npz")
+    for name, value in vars(law).items():
+        np.testing.assert_equal(getattr(again, name), value)
+    assert [w.dtype for w in again.weights] == [np.float32] * len(law.weights)
+
+
+def test_what_is_no_controller_is_refused(tmp_path):
+    path = tmp_path / "controller.npz"
+    with pytest.raises(ValueError, match=r"controller\.npz is not a controller exported as npz"):
+        Law.load(path)
+    *_, law = learned("pitch")
+    law.save(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="not a controller"):
+        Law.load(path)
+    with pytest.raises(ValueError, match="the layers have shapes"):
+        dataclasses.replace(law, weights=law.weights[:1])
+
+
+def test_it_needs_no_jax():
+    code = "import sys, jaxouter.deploy.law; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
