@@ -114,7 +114,7 @@ class Law:
         action = self._action(self._observation(state, np.float32(r), np.float32(y)))
         return np.float32(self._clip(self.offset + self.slope * r + (high - low) / 2 * action))
 
-    def record(self, state: State, y: float, r_tilde: float) -> State:
+    def record(self, state: State, y: float, r_tilde: float | np.float32) -> State:
         """After r~_k is chosen: y_k and r~_k become past."""
         return State(_pushed(state.y_past, y), _pushed(state.r_tilde_past, r_tilde), state.integral)
 
@@ -171,7 +171,7 @@ class Law:
         return cls(**header, weights=weights, biases=biases)
 
 
-def _pushed(past: np.ndarray, value: float) -> np.ndarray:
+def _pushed(past: np.ndarray, value: float | np.float32) -> np.ndarray:
     out = np.empty_like(past)
     out[0] = value
     out[1:] = past[:-1]
