@@ -154,9 +154,6 @@ class Controller:
     Not thread-safe: call it from one thread.
     """
 
-    engaged: bool
-    """Whether it is to control where nothing speaks against it."""
-
     def __init__(
         self,
         law: Law,
@@ -168,7 +165,7 @@ class Controller:
         transfer_steps: int = 10,
         y_range: tuple[float, float] | None = None,
         late_after: float = 1.5,
-        return_after: int = 5,
+        return_after: int = 3,
         clock: Callable[[], float] | None = None,
         record: Callable[[Row], Any] | None = None,
         log_length: int = 1000,
@@ -187,7 +184,7 @@ class Controller:
             late_after: control steps from sample to sample after which one is late.
             return_after: good samples in a row with which control returns; 1: with the first.
             clock: gives the time where `step` is given none, in the law's `time_unit`: `time.monotonic` if that is s.
-            record: called with the `Row` of each step, such as `csv.writer(file).writerow`.
+            record: called with the `Row` of each step, such as `csv.writer(file).writerow`; `step` raises what it raises.
             log_length: events that `log` keeps.
 
         Raises:
@@ -203,7 +200,7 @@ class Controller:
         bounds = law.r_tilde_bounds if bounds is None else bounds
         y_range = law.y_range if y_range is None else y_range
         before = sum(law.setpoint_range) / 2 if r_tilde is None else r_tilde
-        self.law, self.engaged = law, engaged
+        self.law, self._engaged = law, engaged
         self._watch = Watch(before, before, y_range, law.control_step, late_after, return_after)
         self._transfer = Transfer(r_tilde, bounds, rate_limit, transfer_steps)
         self._clock, self._record = clock, record
@@ -228,11 +225,16 @@ class Controller:
 
     def engage(self) -> None:
         """Control from the next step on, where nothing speaks against it."""
-        self.engaged = True
+        self._engaged = True
 
     def disengage(self) -> None:
         """Pass through from the next step on."""
-        self.engaged = False
+        self._engaged = False
+
+    @property
+    def engaged(self) -> bool:
+        """Whether it is to control where nothing speaks against it."""
+        return self._engaged
 
     @property
     def reason(self) -> Reason | None:
@@ -263,7 +265,7 @@ class Controller:
             time = self._clock()
         r_before, y_before = self._watch.within()
         fault = self._watch.judge(r, y, time)
-        reason: Reason | None = fault if self.engaged else "disengaged"
+        reason: Reason | None = fault if self._engaged else "disengaged"
         self._catch_up(r_before, y_before)
         r_k, y_k = self._watch.within()
         if not self._met and _is_number(y):

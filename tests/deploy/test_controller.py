@@ -20,7 +20,7 @@ from jaxouter import plants
 from jaxouter.deploy import Controller
 from jaxouter.deploy.controller import REASONS, Event, Row
 from jaxouter.deploy.law import Law
-from tests.deploy.test_law import learned
+from tests.deploy.test_law import chosen, learned
 
 PART = 2.0  # of the difference at a switch, in the tests with a law of r~ = 3 r
 
@@ -59,18 +59,15 @@ def test_it_acts_like_the_policy(name, tmp_path):
     low, high = law.r_tilde_bounds
     law.save(tmp_path / "controller.npz")
     controller = Controller.load(tmp_path / "controller.npz")
-    rng = np.random.default_rng(1)
-    r, y = rng.uniform(*law.setpoint_range, (2, 100)).astype(np.float32)
-    carry, state, act = policy.init(params, r[0], y[0]), law.init(y[0]), jax.jit(policy.act)
-    seen = []
+    r, y = np.random.default_rng(1).uniform(*law.setpoint_range, (2, 100))
+    state, got, of_law = law.init(y[0]), [], []
     for k, (r_k, y_k) in enumerate(zip(r, y, strict=True)):
-        carry, of_policy = act(params, carry, jnp.asarray(r_k, float), jnp.asarray(y_k, float))
-        state, of_law = law.act(state, r_k, y_k)
-        seen.append((controller.step(r_k, y_k, k * law.control_step), of_law, float(of_policy)))
-    got, of_law, of_policy = np.transpose(seen)
+        state, r_tilde = law.act(state, r_k, y_k)
+        of_law.append(r_tilde)
+        got.append(controller.step(r_k, y_k, k * law.control_step))
     assert np.ptp(got) > 0.01 * (high - low)
     np.testing.assert_allclose(got, of_law, atol=1e-5 * (high - low))
-    np.testing.assert_allclose(got, of_policy, atol=1e-5 * (high - low))
+    np.testing.assert_allclose(got, chosen(policy, params, r, y), atol=1e-5 * (high - low))
     assert type(controller.step(r[0], y[0])) is float
     assert controller.reason is None
     assert set(controller.counts.values()) == {0}
@@ -95,6 +92,11 @@ def test_switching_has_no_bumps(static):
         (15, "pass through", "disengaged"),
         (19, "control", None),
     ]
+
+
+def test_going_and_coming_by_itself_has_no_bumps(static):
+    controller = Controller(static, return_after=2)
+    np.testing.assert_allclose(run(controller, [0.0, None, 0.0, 0.0, 0.0]), [30.0, 28.0, 26.0, 26.4, 26.8])
 
 
 def test_in_closed_loop_no_move_is_larger_than_its_part(pitch):
@@ -263,7 +265,8 @@ def test_in_a_storm_r_tilde_stays_within_bounds_and_rate(pitch, storm, rate_limi
     )
     before = None
     for r, y, time, engaged in storm:
-        controller.engaged = engaged
+        (controller.engage if engaged else controller.disengage)()
+        assert controller.engaged is engaged
         r_tilde = controller.step(r, y, time)
         assert -50.0 <= r_tilde <= 40.0
         assert before is None or abs(r_tilde - before) <= rate_limit * (1 + 1e-9)
