@@ -1,1 +1,5 @@
-"""Where outer loops go: adapters to other tools, each of which needs its extra when it is imported."""
+"""Where outer loops go: the controller, with NumPy alone, and adapters to other tools, each with its extra."""
+
+from jaxouter.deploy.controller import Controller
+
+__all__ = ["Controller"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
@@ -23,7 +24,7 @@ class State(NamedTuple):
 
     y_past: np.ndarray  # (H,), y_(k-1), y_(k-2), ...
     r_tilde_past: np.ndarray  # (H,), r~_(k-1), r~_(k-2), ...
-    integral: np.ndarray  # (), leaky integral of r - y
+    integral: np.float32  # leaky integral of r - y
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,29 +90,55 @@ class Law:
             biases=tuple(np.asarray(layers[name]["bias"], np.float32) for name in names),
         )
 
-    def init(self, y0: float) -> State:
-        """Before the first step: histories filled with y_0, and with r~ = y_0 clipped to its bounds."""
-        y = np.float32(y0)
-        before = np.clip(y, *np.asarray(self.r_tilde_bounds, np.float32))
-        return State(np.full(self.history, y), np.full(self.history, before), np.zeros((), np.float32))
+    def init(self, y0: float, r_tilde: float | None = None) -> State:
+        """Before the first step: histories filled with y_0, and with r~ clipped to its bounds; None: r~ = y_0."""
+        before = self._clip(y0 if r_tilde is None else r_tilde)
+        y_past, r_tilde_past = (np.full(self.history, value, np.float32) for value in (y0, before))
+        return State(y_past, r_tilde_past, np.float32(0.0))
 
     def act(self, state: State, r: float, y: float) -> tuple[State, np.float32]:
         """At t_k: the next state, and r~_k."""
+        state = self.observe(state, r, y)
+        r_tilde = self.r_tilde(state, r, y)
+        return self.record(state, y, r_tilde), r_tilde
+
+    def observe(self, state: State, r: float, y: float) -> State:
+        """At t_k: the state with r_k - y_k integrated."""
+        error = np.float32(r) - np.float32(y)
+        integral = state.integral + (error - state.integral) / np.float32(self.integral_steps)
+        return State(state.y_past, state.r_tilde_past, integral)
+
+    def r_tilde(self, state: State, r: float, y: float) -> np.float32:
+        """r~_k, of a state in which r_k - y_k is integrated."""
         low, high = self.r_tilde_bounds
-        r_k, y_k = np.float32(r), np.float32(y)
-        integral = np.float32(state.integral + (r_k - y_k - state.integral) / np.float32(self.integral_steps))
-        present = np.array([r_k - self.y_middle, r_k - y_k, integral], np.float32)
-        of_y = np.concatenate([present, state.y_past - y_k]) / np.float32(self.y_scale)
-        of_r_tilde = (state.r_tilde_past - np.float32((low + high) / 2)) / np.float32((high - low) / 2)
-        x = np.concatenate([of_y, of_r_tilde])
+        action = self._action(self._observation(state, np.float32(r), np.float32(y)))
+        return np.float32(self._clip(self.offset + self.slope * r + (high - low) / 2 * action))
+
+    def record(self, state: State, y: float, r_tilde: float | np.float32) -> State:
+        """After r~_k is chosen: y_k and r~_k become past."""
+        return State(_pushed(state.y_past, y), _pushed(state.r_tilde_past, r_tilde), state.integral)
+
+    def _observation(self, state: State, r: np.float32, y: np.float32) -> np.ndarray:
+        low, high = self.r_tilde_bounds
+        x = np.empty(3 + 2 * self.history, np.float32)
+        of_y, of_r_tilde = x[: 3 + self.history], x[3 + self.history :]
+        of_y[:3] = r - self.y_middle, r - y, state.integral
+        np.subtract(state.y_past, y, out=of_y[3:])
+        of_y /= self.y_scale
+        np.subtract(state.r_tilde_past, (low + high) / 2, out=of_r_tilde)
+        of_r_tilde /= (high - low) / 2
+        return x
+
+    def _action(self, x: np.ndarray) -> float:
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = np.maximum(x @ weight + bias, np.float32(0.0))
-        action = np.tanh(x @ self.weights[-1] + self.biases[-1])[0]
-        r_tilde = np.float32(np.clip(self.offset + self.slope * r_k + (high - low) / 2 * action, low, high))
-        y_past, r_tilde_past = np.roll(state.y_past, 1), np.roll(state.r_tilde_past, 1)
-        y_past[0], r_tilde_past[0] = y_k, r_tilde
-        after = State(y_past, r_tilde_past, np.asarray(integral))
-        return after, r_tilde
+            x = x.dot(weight)  # less overhead than @, which at these sizes is what counts
+            x += bias
+            np.maximum(x, 0.0, out=x)
+        return math.tanh(x.dot(self.weights[-1])[0] + self.biases[-1][0])
+
+    def _clip(self, r_tilde: float) -> float:
+        low, high = self.r_tilde_bounds
+        return min(max(r_tilde, low), high)
 
     def save(self, path: Path) -> None:
         """Write an npz file: `header`, JSON of everything but the layers, and `weight_i`, `bias_i` of each layer."""
@@ -142,3 +169,10 @@ class Law:
             raise ValueError(f"{path} is damaged: its header has fields {sorted(set(header) ^ names)} missing or more")
         header = {name: tuple(value) if isinstance(value, list) else value for name, value in header.items()}
         return cls(**header, weights=weights, biases=biases)
+
+
+def _pushed(past: np.ndarray, value: float | np.float32) -> np.ndarray:
+    out = np.empty_like(past)
+    out[0] = value
+    out[1:] = past[:-1]
+    return out
