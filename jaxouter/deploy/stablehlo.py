@@ -34,7 +34,7 @@ def exported(policy: LearnedPolicy, params: LearnedParams) -> export.Exported:
         r: jax.Array, y: jax.Array, y_past: jax.Array, r_tilde_past: jax.Array, integral: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         memory, r_tilde = policy.act(numbers, Memory(y_past, r_tilde_past, integral), r, y)
-        return r_tilde, *memory
+        return r_tilde, memory.y_past, memory.r_tilde_past, memory.integral
 
     number = jax.ShapeDtypeStruct((), np.float32)
     past = jax.ShapeDtypeStruct((policy.observer.history,), np.float32)

@@ -32,7 +32,7 @@ class Controller(Protocol):
         """State before the first step."""
         ...
 
-    def act(self, state: Any, r: float, y: float) -> tuple[Any, float]:
+    def act(self, state: Any, r: float, y: float) -> tuple[Any, Any]:
         """One control step: the next state and r~."""
         ...
 
@@ -148,8 +148,8 @@ class OnnxController:
     def act(self, state: State, r: float, y: float) -> tuple[State, float]:
         """One control step."""
         inputs = state._asdict() | {"r": r, "y": y}
-        r_tilde, *after = self._session.run(None, {name: np.asarray(x, np.float32) for name, x in inputs.items()})
-        return State(*after), r_tilde
+        outputs: Any = self._session.run(None, {name: np.asarray(x, np.float32) for name, x in inputs.items()})
+        return State(*outputs[1:]), outputs[0]
 
 
 class StablehloController:
@@ -217,7 +217,7 @@ class FmuController:
         except ImportError:
             raise ImportError('what runs it is not installed: pip install "jaxouter[fmu]"') from None
 
-        description = fmpy.read_model_description(str(path))
+        description: Any = fmpy.read_model_description(str(path))
         self._references = {v.name: v.valueReference for v in description.modelVariables}
         self._step = float(description.defaultExperiment.stepSize)
         self._fmu = FMU2Slave(
