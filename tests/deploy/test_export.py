@@ -344,6 +344,16 @@ def test_c_compiles_without_a_warning_and_runs_from_c(pitch, compiler, tmp_path)
     assert len(got) == 20
 
 
+def test_sources_of_the_fmu_compile_without_a_warning(pitch, tmp_path):
+    path = pitch.export("fmu", tmp_path / "controller.fmu")
+    folder = Path(fmpy.extract(str(path), str(tmp_path / "fmu"))) / "sources"
+    said = fmpy.model_description.read_build_description(str(path))[0].sourceFileSets[0]
+    assert sorted(said.sourceFiles) == sorted(each.name for each in folder.glob("*.c"))
+    command = ["gcc", *STRICT, *MORE, "-shared", "-fPIC", *said.sourceFiles, "-o", "out.so", "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_c_needs_no_memory_and_has_symbols_of_its_own(pitch, tmp_path):
     path = pitch.export("c", tmp_path / "controller.c")
     subprocess.run(["gcc", *STRICT, "-c", str(path), "-o", str(tmp_path / "a.o")], check=True, timeout=60)
