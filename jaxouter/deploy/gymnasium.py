@@ -86,6 +86,12 @@ def _steps(env: Environment, params: EnvParams, carry: Any, actions: np.ndarray)
     return jax.vmap(lambda carry, action: _step(env, params, carry, action))(carry, actions)
 
 
+def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tuple[Environment, EnvParams]:
+    if render_mode is not None:  # stable-baselines3 asks for one, and goes without it on this error alone
+        raise TypeError(f"render_mode is {render_mode!r}; there is nothing to render, so it must be None")
+    return make(plant, **settings)
+
+
 def _spaces(env: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Of the observations and of the actions of one loop."""
     low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(env))
@@ -134,17 +140,19 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     params: EnvParams
     """Its parameters; others of the same structure (sensor noise, say) may take their place, without recompilation."""
 
-    def __init__(self, plant: str, **settings: Any) -> None:
+    def __init__(self, plant: str, *, render_mode: str | None = None, **settings: Any) -> None:
         """Nothing is drawn before `reset`.
 
         Args:
             plant: see `jaxouter.plants.make`.
+            render_mode: there is none.
             **settings: of `jaxouter.make`: history, integral_steps, goal, and parameters of the plant.
 
         Raises:
             ValueError: unknown plant or parameter (lists what exists), or a value that does not fit.
+            TypeError: a render_mode is asked for.
         """
-        self.functional, self.params = make(plant, **settings)
+        self.functional, self.params = _made(plant, render_mode, settings)
         self.observation_space, self.action_space = _spaces(self.functional)
         self._carry: Any = None
 
@@ -207,20 +215,21 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     params: EnvParams
     """Its parameters, of all loops."""
 
-    def __init__(self, plant: str, num_envs: int = 1, **settings: Any) -> None:
+    def __init__(self, plant: str, num_envs: int = 1, *, render_mode: str | None = None, **settings: Any) -> None:
         """Nothing is drawn before `reset`.
 
         Args:
-            plant, **settings: as `OuterLoop`.
+            plant, render_mode, **settings: as `OuterLoop`.
             num_envs: n, number of loops.
 
         Raises:
             ValueError: as `OuterLoop`, or num_envs is below 1.
+            TypeError: a render_mode is asked for.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
         self.num_envs = num_envs
-        self.functional, self.params = make(plant, **settings)
+        self.functional, self.params = _made(plant, render_mode, settings)
         self.single_observation_space, self.single_action_space = _spaces(self.functional)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)

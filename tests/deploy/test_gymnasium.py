@@ -192,6 +192,13 @@ def test_loops_that_cannot_be() -> None:
         make_loops(2).reset(seed=[0, 1, 2])
 
 
+@pytest.mark.parametrize("kind", [OuterLoop, OuterLoops])
+def test_there_is_nothing_to_render(kind: Any) -> None:
+    kind("lag", render_mode=None)
+    with pytest.raises(TypeError, match="render_mode is 'rgb_array'; there is nothing to render, so it must be None"):
+        kind("lag", render_mode="rgb_array")
+
+
 def test_step_before_reset() -> None:
     for env, action in ((make(), np.zeros(1)), (make_loops(2), np.zeros((2, 1)))):
         with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
