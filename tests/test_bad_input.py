@@ -225,6 +225,6 @@ def test_a_run_folder_from_someone_else_executes_nothing(tmp_path, monkeypatch):
         for main, arguments in ((evaluate.main, ["run"]), (train.main, ["--resume", "run"])):
             status, text = ended(main, arguments)
             assert status == 2
-            assert "there is no plant" in text
+            assert "code is never imported" in text
     assert not (tmp_path / "executed").exists()
     assert preset("pitch").plant == "pitch"
