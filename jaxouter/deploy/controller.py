@@ -184,7 +184,7 @@ class Controller:
             late_after: control steps from sample to sample after which one is late.
             return_after: good samples in a row with which control returns; 1: with the first.
             clock: gives the time where `step` is given none, in the law's `time_unit`: `time.monotonic` if that is s.
-            record: called with the `Row` of each step, such as `csv.writer(file).writerow`; `step` raises what it raises.
+            record: called with the `Row` of each step, such as `csv.writer(file).writerow`.
             log_length: events that `log` keeps.
 
         Raises:
