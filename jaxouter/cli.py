@@ -6,7 +6,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -19,8 +19,9 @@ from rich.table import Table
 from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.rivals import NAMES
+from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.training.config import PRESETS, TrainConfig
-from jaxouter.training.run import DamagedWarning
+from jaxouter.training.run import RunWarning
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
 LINE_SECONDS = 5.0  # between two plain lines of progress
@@ -31,7 +32,7 @@ def user_errors() -> Iterator[None]:
     """A ValueError in here is the user's mistake: one message, exit status 2; a warning is one line."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("always", DamagedWarning)
+            warnings.simplefilter("always", RunWarning)
             warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
             yield
     except ValueError as error:
@@ -54,6 +55,13 @@ def use_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
 
 
+def use_plants(sources: Iterable[Source]) -> None:
+    """What a process of its own begins with: the plants that its parent knows, and the compilation cache."""
+    for source in sources:
+        add(source.reference, source.options)
+    use_compilation_cache()
+
+
 def print_lists() -> None:
     """Plants, presets, scenarios, sweeps and policies."""
     for name in plants.REGISTRY:
@@ -61,6 +69,7 @@ def print_lists() -> None:
         console.print("  presets:   " + ", ".join(PRESETS.get(name, PRESETS["pitch"])))
         console.print("  scenarios: " + ", ".join(scenarios.catalogue(name)))
         console.print("  sweeps:    " + ", ".join(sweeps.catalogue(name)))
+    console.print("plants of your own: " + FORMS)
     console.print("policies: a run folder, " + ", ".join(NAMES))
 
 

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,9 @@ from jaxouter import cli, plants
 from jaxouter.evaluation import board, comparison, report, scenarios, statistics, sweeps
 from jaxouter.evaluation.board import Contender, Done, Job
 from jaxouter.evaluation.rivals import CLAIRVOYANT, NAMES, RIVALS
-from jaxouter.training.run import open_run, surroundings, write_json
+from jaxouter.plants import Plant
+from jaxouter.plants.sources import SOURCES, attribute
+from jaxouter.training.run import add_plant, open_run, surroundings, write_json
 
 FORMAT = 1
 
@@ -33,7 +36,7 @@ class Options:
     """
 
     plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
-    """pitch or heaters; default: that of the runs, or pitch."""
+    """pitch, heaters or your own: FILE.py:NAME, gym:ID, fmu:FILE; default: that of the runs, or pitch."""
     run: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")] = ()
     """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()
@@ -97,9 +100,9 @@ def check(options: Options) -> Plan:
     Raises:
         ValueError: the options do not fit together, or name what does not exist.
     """
+    named_plant = None if options.plant is None else add_plant(options.plant, *options.run[:1] or (None,))
     runs = [open_run(path) for path in options.run]
-    plant = options.plant or (runs[0][0].config.plant if runs else "pitch")
-    plants.resolve(plant)
+    plant = named_plant or (runs[0][0].config.plant if runs else "pitch")
     for path, (run, _, _) in zip(options.run, runs, strict=True):
         if run.config.plant != plant:
             raise ValueError(f"{path} is a run on {run.config.plant}; the comparison is on {plant}")
@@ -117,7 +120,7 @@ def check(options: Options) -> Plan:
         for run, median, chosen in runs
         for seed in (chosen if len(chosen) == 1 else sorted(chosen, key=lambda seed: seed != median))
     ]
-    contenders = list(dict.fromkeys([*contenders, *named(options.policy)]))
+    contenders = list(dict.fromkeys([*contenders, *named(options.policy, plants.make(plant)[0])]))
     for contender in contenders:
         if contender.kind in ("learned", "user"):
             board.load(contender, plant)  # what can't be loaded is said before minutes of tuning
@@ -131,25 +134,30 @@ def check(options: Options) -> Plan:
     )
 
 
-def named(names: Sequence[str]) -> list[Contender]:
-    """The policies with these names, and a user's own; where no name is given, all.
+def named(names: Sequence[str], plant: Plant) -> list[Contender]:
+    """The policies with these names, and a user's own; where no name is given, all that the plant allows.
 
     Raises:
-        ValueError: there is no such policy or file.
+        ValueError: there is no such policy or file, or the plant does not allow it.
     """
+    needs = {"oracle": ("differentiable", plant.differentiable), CLAIRVOYANT: ("affine", plant.affine)}
+    impossible = {name: what for name, (what, holds) in needs.items() if not holds}
     own, built_in = [], []
     for name in dict.fromkeys(names):
-        file, colon, attribute = name.rpartition(":")
+        file, colon, name_in_file = name.rpartition(":")
         if colon and file.endswith(".py"):
-            board.load_class(Path(file), attribute)
-            own.append(Contender(f"{Path(file).name}:{attribute}", "user", file, None, attribute))
+            attribute(Path(file), name_in_file, board.OWN)
+            own.append(Contender(f"{Path(file).name}:{name_in_file}", "user", file, None, name_in_file))
             if [c.name for c in own].count(own[-1].name) > 1:  # of several files with this name
                 own[-1] = own[-1]._replace(name=name)
+        elif name in impossible:
+            raise ValueError(f"there is no {name} for {plant.name}, which is not declared {impossible[name]}")
         elif name in NAMES:
             built_in.append(name)
         else:
             raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
-    chosen = [name for name in NAMES if name == "none" or not built_in or name in built_in]
+    possible = [name for name in NAMES if name not in impossible]
+    chosen = [name for name in possible if name == "none" or not built_in or name in built_in]
     return own + [Contender(name, "preview" if name == CLAIRVOYANT else RIVALS[name].kind) for name in chosen]
 
 
@@ -172,7 +180,7 @@ def work(plan: Plan) -> list[Done]:
     jobs = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
     done: dict[Job, Done] = {}
     with cli.JobProgress(len(jobs)) as progress:
-        for finished in board.spread(jobs, cli.use_compilation_cache, progress.say):
+        for finished in board.spread(jobs, partial(cli.use_plants, tuple(SOURCES.values())), progress.say):
             done[finished.job] = finished
             progress.advance(f"{finished.job}: {finished.seconds:.0f} s")
     return [done[job] for job in jobs]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ from jaxouter import cli, plants
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.rivals import RIVALS
-from jaxouter.training.run import open_run, write_json
+from jaxouter.training.run import add_plant, open_run, write_json
 
 SHOWN = (
     "mae",
@@ -38,6 +38,8 @@ class Options:
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder, or the folder of one seed in it."""
+    plant: str | None = None
+    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE; without a run, that of the policy."""
     policy: str | None = None
     """A rival instead, such as none (r~ = r) or static (inverse of the DC gain); identified first, once."""
     scenario: tuple[str, ...] = ()
@@ -60,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
+        if options.plant is not None:
+            options = replace(options, plant=add_plant(options.plant, options.run))
         check(options)
         cli.use_compilation_cache()
         policies, origin = choose(options)
@@ -115,7 +119,8 @@ def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
         ValueError: the folder is no run, or has no checkpoint.
     """
     if options.policy is not None:
-        given = {name.split("/")[0] for name in options.scenario} or set(plants.REGISTRY)
+        every = set(plants.REGISTRY) if options.plant is None else {options.plant}
+        given = {name.split("/")[0] for name in options.scenario} or every
         names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
         return {name: rival(options.policy, name) for name in names}, {}
     assert options.run is not None  # as `check` found

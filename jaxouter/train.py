@@ -22,6 +22,7 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.plants.sources import add
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
@@ -33,7 +34,7 @@ from jaxouter.training.trainer import Trainer, TrainState
 
 @dataclass(frozen=True)
 class Options:
-    """Train an outer loop on a plant (pitch or heaters) and show what came out.
+    """Train an outer loop on a plant (pitch, heaters or your own) and show what came out.
 
     Without options the pitch plant is learned with the default preset. The preset sets every other field; what is
     given here overrides it. `--list` prints plants, presets, scenarios and policies.
@@ -43,7 +44,8 @@ class Options:
     out: Path | None = None
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Go on with the run in this folder; takes no other option but --tensorboard, --dry-run, --devices (draws go on
+    """Go on with the run in this folder; takes no other option but a plant of your own, which is named
+    again, --tensorboard, --dry-run, --devices (draws go on
     otherwise where a learner then spans another number of them) and how to find the other processes."""
     coordinator: str | None = None
     """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
@@ -66,19 +68,25 @@ def parse(arguments: list[str]) -> Options:
     first = Options(preset("pitch"))
     plain = [argument for argument in arguments if argument not in ("-h", "--help")]
     config = tyro.cli(Options, prog=program, args=plain, default=first).config
-    options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(config.plant, config.preset)))
+    plant = add(config.plant, config.plant_options)
+    options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(plant, config.preset)))
+    options = dataclasses.replace(options, config=dataclasses.replace(options.config, plant=plant))
     if options.resume is not None:
         execution = {
             name: getattr(options, name)
             for name in ("resume", "dry_run", "tensorboard", *Processes.__dataclass_fields__)
         }
-        config = dataclasses.replace(first.config, devices=options.config.devices)
+        config = dataclasses.replace(
+            preset(plant), devices=options.config.devices, plant_options=options.config.plant_options
+        )
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
-                "--resume takes no other option but --devices, --coordinator, --num-processes, --process-id, "
-                "--tensorboard and --dry-run: the run folder holds them all"
+                "--resume takes no other option but a plant of your own, --devices, --coordinator, --num-processes, "
+                "--process-id, --tensorboard and --dry-run: the run folder holds them all"
             )
         run = Run.open(options.resume).config
+        if plant not in (run.plant, first.config.plant):
+            raise ValueError(f"{options.resume} is a run on {run.plant}, not on {plant}")
         given = any(argument.split("=")[0] == "--devices" for argument in arguments)
         options = dataclasses.replace(
             options, config=dataclasses.replace(run, devices=options.config.devices if given else run.devices)

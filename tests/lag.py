@@ -113,6 +113,7 @@ LAG = Plant(
     start=start,
     variables=variables,
     settled=settled,
+    affine=True,
     y_unit="1",
     time_unit="s",
     control_step=CONTROL_STEP,

@@ -1,14 +1,17 @@
-"""One environment for learners that step through Gymnasium; needs the extra `gymnasium`.
+"""Environments for learners that step through Gymnasium; needs the extra `gymnasium`.
 
-    env = OuterLoop("pitch", tau=0.5)
-    obs, info = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    import jaxouter.deploy.gymnasium  # registers jaxouter/Pitch-v0 and jaxouter/Heaters-v0
 
-It is `jaxouter.loop.environment` with NumPy at its edges. Training on many environments at once is faster on that one.
+    env = gymnasium.make("jaxouter/Pitch-v0", tau=0.5)
+    envs = gymnasium.make_vec("jaxouter/Pitch-v0", num_envs=64, tau=0.5)
+
+They are `jaxouter.loop.environment` with NumPy at its edges. Gymnasium has no plug-ins since 1.0: it knows an id after
+this import, or with the module before it, `gymnasium.make("jaxouter.deploy.gymnasium:jaxouter/Pitch-v0")`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,11 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxouter import plants
 from jaxouter.loop.environment import Environment, EnvParams, EnvState, make
 from jaxouter.loop.observation import Memory
 
 try:
     import gymnasium
+    from gymnasium.utils import seeding
 except ImportError as error:
     raise ImportError('jaxouter.deploy.gymnasium needs Gymnasium: pip install "jaxouter[gymnasium]"') from error
 
@@ -59,12 +64,53 @@ def _reset(env: Environment, params: EnvParams, seed: np.uint32) -> tuple[Any, A
 @partial(jax.jit, static_argnums=0)
 def _step(
     env: Environment, params: EnvParams, carry: tuple[chex.PRNGKey, EnvState], action: np.ndarray
-) -> tuple[Any, Any]:
+) -> tuple[Any, Any, Any]:
     key, key_step = jax.random.split(carry[0])
     low, high = env.plant.r_tilde_bounds
     r_tilde = (low + high) / 2 + (high - low) / 2 * jnp.asarray(action[0], float)
     obs, state, reward, terminated, truncated, _ = env.step_env(key_step, carry[1], r_tilde, params)
-    return (key, state), (*_seen(env, obs, state), reward, terminated, truncated)
+    return (key, state), _seen(env, obs, state), (reward, terminated, truncated)
+
+
+@partial(jax.jit, static_argnums=0)
+def _resets(env: Environment, params: EnvParams, seeds: np.ndarray, chosen: np.ndarray, before: Any) -> Any:
+    """New episodes where chosen, (n,) bool; elsewhere what there was before. If that is None, everywhere."""
+    new = jax.vmap(lambda seed: _reset(env, params, seed))(seeds)
+    if before is None:
+        return new
+    return jax.vmap(lambda here, *both: jax.tree.map(partial(jnp.where, here), *both))(chosen, new, before)
+
+
+@partial(jax.jit, static_argnums=0)
+def _steps(env: Environment, params: EnvParams, carry: Any, actions: np.ndarray) -> Any:
+    return jax.vmap(lambda carry, action: _step(env, params, carry, action))(carry, actions)
+
+
+def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tuple[Environment, EnvParams]:
+    if render_mode is not None:  # stable-baselines3 asks for one, and goes without it on this error alone
+        raise TypeError(f"render_mode is {render_mode!r}; there is nothing to render, so it must be None")
+    return make(plant, **settings)
+
+
+def _spaces(env: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of the observations and of the actions of one loop."""
+    low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(env))
+    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+
+def _draw(generator: np.random.Generator) -> np.uint32:
+    """What an episode's key is made of."""
+    return generator.integers(2**32, dtype=np.uint32)
+
+
+def _checked(carry: Any, action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The action, if a step can be made with it."""
+    if carry is None:
+        raise gymnasium.error.ResetNeeded("step was called before the first reset; call reset first")
+    action = np.asarray(action)
+    if action.shape != shape or not np.isfinite(action).all():
+        raise ValueError(f"action is {action!r}; it must be finite numbers in an array of shape {shape}")
+    return action
 
 
 def _array(obs: np.ndarray) -> np.ndarray:
@@ -94,20 +140,20 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     params: EnvParams
     """Its parameters; others of the same structure (sensor noise, say) may take their place, without recompilation."""
 
-    def __init__(self, plant: str, **settings: Any) -> None:
+    def __init__(self, plant: str, *, render_mode: str | None = None, **settings: Any) -> None:
         """Nothing is drawn before `reset`.
 
         Args:
             plant: see `jaxouter.plants.make`.
+            render_mode: there is none.
             **settings: of `jaxouter.make`: history, integral_steps, goal, and parameters of the plant.
 
         Raises:
             ValueError: unknown plant or parameter (lists what exists), or a value that does not fit.
+            TypeError: a render_mode is asked for.
         """
-        self.functional, self.params = make(plant, **settings)
-        low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(self.functional))
-        self.observation_space = gymnasium.spaces.Box(low, high)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+        self.functional, self.params = _made(plant, render_mode, settings)
+        self.observation_space, self.action_space = _spaces(self.functional)
         self._carry: Any = None
 
     def reset(
@@ -124,8 +170,7 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         super().reset(seed=seed)
         del options
-        draw = self.np_random.integers(2**32, dtype=np.uint32)
-        self._carry, seen = _reset(self.functional, self.params, draw)
+        self._carry, seen = _reset(self.functional, self.params, _draw(self.np_random))
         obs, info = jax.device_get(seen)
         return _array(obs), _floats(info)
 
@@ -142,15 +187,137 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: before the first `reset`.
             ValueError: action is not one finite number in an array of shape (1,).
         """
-        if self._carry is None:
-            raise gymnasium.error.ResetNeeded("step was called before the first reset; call reset first")
-        action = np.asarray(action)
-        if action.shape != (1,) or not np.isfinite(action[0]):
-            raise ValueError(f"action is {action!r}; it must be one finite number in an array of shape (1,)")
-        self._carry, seen = _step(self.functional, self.params, self._carry, action)
-        obs, info, reward, terminated, truncated = jax.device_get(seen)
+        action = _checked(self._carry, action, (1,))
+        self._carry, *after = _step(self.functional, self.params, self._carry, action)
+        (obs, info), (reward, terminated, truncated) = jax.device_get(after)
         return _array(obs), float(reward), bool(terminated), bool(truncated), _floats(info)
 
 
 def _floats(info: dict[str, np.ndarray]) -> dict[str, Any]:
     return {name: float(value) for name, value in info.items()}
+
+
+class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many outer loops of one kind, each with a draw of its own, in one compiled call a step.
+
+    All that comes out is what `gymnasium.vector.SyncVectorEnv` over as many `OuterLoop` gives in its mode `SAME_STEP`:
+    where an episode ends, the observation is the first of the next one, the last of the old one stands in
+    `infos["final_obs"]` (bootstrap from it unless terminated), and its info in `infos["final_info"]`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": [],
+        "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
+    }
+
+    functional: Environment
+    """The environment without state, of one loop."""
+    params: EnvParams
+    """Its parameters, of all loops."""
+
+    def __init__(self, plant: str, num_envs: int = 1, *, render_mode: str | None = None, **settings: Any) -> None:
+        """Nothing is drawn before `reset`.
+
+        Args:
+            plant, render_mode, **settings: as `OuterLoop`.
+            num_envs: n, number of loops.
+
+        Raises:
+            ValueError: as `OuterLoop`, or num_envs is below 1.
+            TypeError: a render_mode is asked for.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
+        self.num_envs = num_envs
+        self.functional, self.params = _made(plant, render_mode, settings)
+        self.single_observation_space, self.single_action_space = _spaces(self.functional)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._generators = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._carry: Any = None
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """New episodes of all loops.
+
+        Args:
+            seed: of loop 0, that of loop i is seed + i; or one for each; None: go on with those before.
+            options: there are none.
+
+        Returns:
+            obs (n, 3 + 2H) float32 and infos.
+
+        Raises:
+            ValueError: there is not a seed for each loop.
+        """
+        del options
+        seeds = [seed] * self.num_envs if seed is None else seed
+        seeds = [seeds + i for i in range(self.num_envs)] if isinstance(seeds, int) else seeds
+        if len(seeds) != self.num_envs:
+            raise ValueError(
+                f"seed has {len(seeds)} elements; it must be one number or one for each of {self.num_envs}"
+            )
+        self._generators = [
+            generator if seed is None else seeding.np_random(seed)[0]
+            for generator, seed in zip(self._generators, seeds, strict=True)
+        ]
+        obs, info = self._restart(np.ones(self.num_envs, bool), None)
+        return _array(obs), _infos(info, np.ones(self.num_envs, bool))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step of all loops.
+
+        Args:
+            actions: (n, 1), scaled r~, clipped to [-1, 1].
+
+        Returns:
+            obs (n, 3 + 2H) float32, reward (n,), terminated (n,), truncated (n,), infos.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first `reset`.
+            ValueError: actions are not finite numbers in an array of shape (n, 1).
+        """
+        actions = _checked(self._carry, actions, (self.num_envs, 1))
+        self._carry, seen, outcome = _steps(self.functional, self.params, self._carry, actions)
+        (obs, info), (reward, terminated, truncated) = jax.device_get((seen, outcome))
+        ended, infos = terminated | truncated, {}
+        if ended.any():
+            infos = _batched({"final_obs": _rows(_array(obs), ended), "final_info": _infos(info, ended)}, ended)
+            obs, info = self._restart(ended, (self._carry, seen))
+        infos |= _infos(info, np.ones(self.num_envs, bool))
+        return _array(obs), np.array(reward, float), np.array(terminated), np.array(truncated), infos
+
+    def _restart(self, chosen: np.ndarray, before: Any) -> Any:
+        """What is seen after new episodes were begun where chosen."""
+        seeds = np.zeros(self.num_envs, np.uint32)
+        for i in np.flatnonzero(chosen):
+            seeds[i] = _draw(self._generators[i])
+        self._carry, seen = _resets(self.functional, self.params, seeds, chosen, before)
+        return jax.device_get(seen)
+
+
+def _rows(array: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The chosen rows as objects, None elsewhere; (n,)."""
+    rows = np.full(len(array), None, object)
+    for i in np.flatnonzero(chosen):
+        rows[i] = array[i]
+    return rows
+
+
+def _infos(info: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, Any]:
+    return _batched({name: np.where(chosen, np.array(value, float), 0.0) for name, value in info.items()}, chosen)
+
+
+def _batched(values: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form of infos: beside each value stands who has it."""
+    return values | {f"_{name}": chosen.copy() for name in values}
+
+
+for _plant in plants.REGISTRY:
+    gymnasium.register(
+        f"jaxouter/{_plant.capitalize()}-v0",
+        entry_point=f"{__name__}:OuterLoop",
+        vector_entry_point=f"{__name__}:OuterLoops",
+        kwargs={"plant": _plant},
+    )

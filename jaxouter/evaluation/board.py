@@ -6,11 +6,9 @@ but code and configuration, all that concerns the built-in rivals, is kept in th
 
 from __future__ import annotations
 
-import importlib.util
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,6 +29,7 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import make
+from jaxouter.plants.sources import attribute
 from jaxouter.training.run import Run
 
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
@@ -38,6 +37,7 @@ SET_POINTS = 5  # of the certificate, over the range of evaluation
 LEARNED_NOTE = "The learned outer loop, without exploration."
 TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
 Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
+OWN = "a policy of your own"
 PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
 
 
@@ -78,28 +78,6 @@ class Done(NamedTuple):
     seconds: float
 
 
-def load_class(path: Path, attribute: str) -> Any:
-    """The class in a user's file.
-
-    Raises:
-        ValueError: there is no such file or class, or the file can't be imported.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path} is not a file; a policy of your own is named FILE.py:CLASS")
-    spec = importlib.util.spec_from_file_location(f"policy_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{path} is not a Python file; a policy of your own is named FILE.py:CLASS")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise ValueError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
-    if not hasattr(module, attribute):
-        raise ValueError(f"{path} has no class {attribute!r}")
-    return getattr(module, attribute)
-
-
 @lru_cache(maxsize=64)
 def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
     """The policy and its parameters.
@@ -114,7 +92,7 @@ def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
         return run.trainer[0].policy, run.trainer[0].policy_params(state)
     if contender.kind == "user":
         try:
-            policy = load_class(Path(contender.path or ""), contender.attribute)(plant)
+            policy = attribute(Path(contender.path or ""), contender.attribute, OWN)(plant)
         except Exception as error:
             raise ValueError(f"{contender.name} can't be made: {type(error).__name__}: {error}") from error
         return policy, getattr(policy, "params", ())
@@ -191,7 +169,7 @@ def jobs(
     work += [
         Job("certify", c, plant, on, family_seed)
         for on in scenarios.stability_scenarios(plant)
-        if on in met
+        if on in met and make(plant)[0].differentiable
         for c in one_seed
     ]
     return work

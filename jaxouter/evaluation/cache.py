@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 import jaxouter
+from jaxouter.plants import sources
 
 PACKAGE = Path(jaxouter.__file__).parent
 SOURCES = ("plants", "loop", "agents", "training", "evaluation/rivals")
@@ -53,7 +54,8 @@ def cached(name: str, key: Mapping[str, Any], make: Callable[[], Tuned]) -> Tune
         key: JSON values that the result depends on, beside the code.
         make: makes it.
     """
-    text = json.dumps({"code": code(), **key}, sort_keys=True)
+    own = {name: repr(source) for name, source in sources.SOURCES.items()}
+    text = json.dumps({"code": code(), **key} | ({"plants": own} if own else {}), sort_keys=True)
     path = folder() / "rivals" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:

@@ -54,10 +54,10 @@ class Plant:
     """Least and largest r~, in `y_unit`."""
     setpoint_range: tuple[float, float]
     """Set-points of the training distribution (spec section 5)."""
-    evaluation_range: tuple[float, float]
-    """Set-points of the evaluation families (spec section 6)."""
-    divergence_bounds: tuple[float, float]
-    """Training ends an episode when y leaves these."""
+    evaluation_range: tuple[float, float] = ()  # type: ignore[assignment]
+    """Set-points of the evaluation families (spec section 6); default: those of training."""
+    divergence_bounds: tuple[float, float] = ()  # type: ignore[assignment]
+    """Training ends an episode when y leaves these; default: twice the range of r~ beyond each of its ends."""
     output_limit: float | None = None
     """|y| must not exceed this (the paper's L on pitch)."""
     rate_limit: float | None = None
@@ -71,6 +71,10 @@ class Plant:
     family_steps: int = 600
     """Length of a family member in control steps (`steps`: one episode)."""
 
+    differentiable: bool = True
+    """Whether its functions are; `oracle` and certificate need it."""
+    affine: bool = False
+    """Whether y is affine in r~ with additive noise along any episode; `clairvoyant` needs it."""
     start: Callable[[chex.PRNGKey, Any], Any] | None = None
     """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
     draw: Callable[[chex.PRNGKey, Any], Any] | None = None
@@ -95,6 +99,10 @@ class Plant:
     """`widened(params, ranges) -> params`: the same plant, so made that its numbers may lie in these ranges."""
 
     def __post_init__(self) -> None:
+        low, high = self.r_tilde_bounds
+        beyond = 2 * (high - low)
+        object.__setattr__(self, "evaluation_range", self.evaluation_range or self.setpoint_range)
+        object.__setattr__(self, "divergence_bounds", self.divergence_bounds or (low - beyond, high + beyond))
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):
             low, high = getattr(self, field)
             if not low < high:

@@ -257,6 +257,7 @@ HEATERS = Plant(
     variables=variables,
     settled=settled,
     noise_free=noise_free,
+    affine=True,
     y_unit="degC",
     time_unit="h",
     control_step=CONTROL_STEP,

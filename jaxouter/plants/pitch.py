@@ -387,6 +387,7 @@ PITCH = Plant(
     settled=settled,
     smallest=smallest,
     widened=widened,
+    affine=True,
     y_unit="crad",
     time_unit="s",
     control_step=CONTROL_STEP,

@@ -13,6 +13,7 @@ import tyro
 from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop.identify import LEVELS
+from jaxouter.plants.simulators import PlantOptions
 
 HUGE = 2**31  # no number of a configuration is as large
 
@@ -58,7 +59,7 @@ class TrainConfig:
     """One training run. Every field is an option of `python -m jaxouter.train`."""
 
     plant: Annotated[str, tyro.conf.Positional]
-    """Plant to learn on."""
+    """Plant to learn on: pitch, heaters, FILE.py:NAME (a plant of your own), gym:ID or fmu:FILE."""
     preset: str
     """The preset that gave the defaults."""
     seed: int = 0
@@ -98,6 +99,8 @@ class TrainConfig:
     """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
     noise_end: float = 1.0
     """Factor on the volatility at the end of training, reached linearly."""
+    plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
+    """What a plant gym:ID or fmu:FILE does not say itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
     """The start."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
@@ -312,13 +315,19 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     Raises:
         ValueError: a field is missing, unknown or of another type.
     """
-    # Runs of versions that knew one device only, no pretraining and no randomisation, go on as they were.
-    whole = {"devices": 1, "randomise": (), "pretraining": {}, "ddpg": {}, **values}
-    for name, added in (("pretraining", dataclasses.asdict(PretrainingConfig())), ("ddpg", {"actor_from": 0})):
+    # Runs of versions that knew one device only, no pretraining, randomisation or options go on as they were.
+    whole = {"devices": 1, "randomise": (), "plant_options": {}, "pretraining": {}, "ddpg": {}, **values}
+    added_since = {
+        "plant_options": dataclasses.asdict(PlantOptions()),
+        "pretraining": dataclasses.asdict(PretrainingConfig()),
+        "ddpg": {"actor_from": 0},
+    }
+    for name, added in added_since.items():
         if not isinstance(whole[name], dict):
             raise ValueError(f"{name} is {whole[name]!r}; it must be an object with its fields")
         whole[name] = added | whole[name]
-    for cls, of_cls in ((TrainConfig, whole), (PretrainingConfig, whole["pretraining"]), (DDPGConfig, whole["ddpg"])):
+    kinds = (TrainConfig, whole), (PlantOptions, whole["plant_options"]), (PretrainingConfig, whole["pretraining"])
+    for cls, of_cls in (*kinds, (DDPGConfig, whole["ddpg"])):
         names = {f.name for f in dataclasses.fields(cls)}
         if set(of_cls) != names:
             raise ValueError(f"the configuration has fields {sorted(map(str, set(of_cls) ^ names))} missing or unknown")

@@ -22,7 +22,8 @@ import jax
 
 import jaxouter
 from jaxouter.loop.environment import EnvParams
-from jaxouter.plants import Ranges
+from jaxouter.plants import REGISTRY, Ranges
+from jaxouter.plants.sources import SOURCES, add
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
 from jaxouter.training.devices import Fleet
@@ -33,8 +34,8 @@ FORMAT = 1
 KEEP = 2  # checkpoints of each seed
 
 
-class DamagedWarning(UserWarning):
-    """A file of the run folder is damaged, and another is used in its place."""
+class RunWarning(UserWarning):
+    """What users of a run folder should know: a file is damaged and another used in its place, its plant changed."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Run:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 made = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
                 run = cls(made, config)
-                write_json(made / "config.json", {"format": FORMAT, "config": to_dict(config)} | surroundings())
+                write_json(made / "config.json", {"format": FORMAT, "config": to_dict(config)} | surroundings(config))
                 for seed in run.seeds:
                     run.seed_folder(seed).mkdir()
                 made.chmod(0o755)
@@ -84,16 +85,17 @@ class Run:
         Raises:
             ValueError: it is no run, or one of another format.
         """
-        try:
-            content = json.loads((path / "config.json").read_text())
-        except (OSError, ValueError, RecursionError):
-            raise ValueError(f"{path} is not a run folder: it has no readable config.json") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{path}/config.json is not of format {FORMAT}, the one that this version reads")
-        try:
-            return cls(path, from_dict(content["config"]))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise ValueError(f"{path}/config.json is not a configuration: {error}") from None
+        config, was = _read(path)
+        run = cls(path, config)
+        if (name := run.config.plant) not in REGISTRY:
+            raise ValueError(
+                f"{path} is a run on {name}, {was.get('reference', 'of another machine')!r} when it was made; code is "
+                "never imported because a run folder names it, so name this plant on the command line"
+            )
+        if name in SOURCES and was.get("sha256") != SOURCES[name].sha256:
+            message = f"{path}: {SOURCES[name].reference} is not what it was when the run was made"
+            warnings.warn(message, RunWarning, stacklevel=2)
+        return run
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -122,7 +124,7 @@ class Run:
 
     def changes(self) -> list[str]:
         """What the results depend on and is no longer what it was when the run was made."""
-        before, now = json.loads((self.path / "config.json").read_text()), surroundings()
+        before, now = json.loads((self.path / "config.json").read_text()), surroundings(self.config)
         pairs = []
         for group, values in now.items():
             was = before.get(group)
@@ -171,7 +173,7 @@ class Run:
             try:
                 checkpoint.read(path)
             except ValueError as error:
-                warnings.warn(f"{error}; it is left out", DamagedWarning, stacklevel=2)
+                warnings.warn(f"{error}; it is left out", RunWarning, stacklevel=2)
                 del found[epoch]
         return found
 
@@ -236,7 +238,7 @@ class Run:
             actor = jax.eval_shape(trainer.learner.init, jax.random.key(0)).actor
             return checkpoint.load(path, jax.eval_shape(Rehearsal.begin, actor))[0]
         except ValueError as error:
-            warnings.warn(f"{error}; the pretraining begins anew", DamagedWarning, stacklevel=2)
+            warnings.warn(f"{error}; the pretraining begins anew", RunWarning, stacklevel=2)
             return None
 
     def forget_rehearsals(self) -> None:
@@ -290,6 +292,38 @@ class Run:
         checkpoint.write(self.seed_folder(seed) / "metrics.jsonl", "".join(rows).encode())
 
 
+def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration of a run, and where its plant was from.
+
+    Raises:
+        ValueError: the folder is no run, or one of another format.
+    """
+    try:
+        content = json.loads((path / "config.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        raise ValueError(f"{path} is not a run folder: it has no readable config.json") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path}/config.json is not of format {FORMAT}, the one that this version reads")
+    try:
+        config = from_dict(content["config"])
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path}/config.json is not a configuration: {error}") from None
+    plant = content.get("plant")
+    return config, plant if isinstance(plant, dict) else {}
+
+
+def add_plant(reference: str, path: Path | None) -> str:
+    """Short name of the plant that a command line names, made with the options of the run in a folder (or of a seed).
+
+    Raises:
+        ValueError: there is no such plant, or the folder is no run.
+    """
+    if path is None:
+        return add(reference)
+    folder = path if (path / "config.json").exists() else path.resolve().parent
+    return add(reference, _read(folder)[0].plant_options)
+
+
 def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
     """The run in a folder, its median seed and all its seeds; of the folder of one seed that one alone.
 
@@ -307,16 +341,17 @@ def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
     return run, run.median_seed(), tuple(run.seeds)
 
 
-def surroundings() -> dict[str, Any]:
-    """What a result depends on beside the configuration."""
+def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
+    """What a result depends on beside the configuration; with one also where its plant is from, unless built in."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")
     device = jax.devices()[0]
+    source = None if config is None else SOURCES.get(config.plant)
     return {
         "versions": {"jaxouter": jaxouter.__version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},
         "device": {"kind": device.device_kind, "platform": device.platform, "count": jax.device_count()},
         "flags": {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "x64": bool(jax.config.read("jax_enable_x64"))},
-    }
+    } | ({} if source is None else {"plant": {"reference": source.reference, "sha256": source.sha256}})
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,4 +1,4 @@
-"""The Gymnasium adapter: Gymnasium's own checks, and that it is the functional environment."""
+"""The Gymnasium adapters: Gymnasium's own checks, and that they are the functional environment."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 
 import jaxouter
 from jaxouter import plants
-from jaxouter.deploy.gymnasium import OuterLoop
+from jaxouter.deploy.gymnasium import OuterLoop, OuterLoops
 from jaxouter.loop import sensor
 from jaxouter.loop.environment import Environment
 from jaxouter.loop.references import Reaimed
@@ -36,6 +35,11 @@ def make(**settings: Any) -> OuterLoop:
     return OuterLoop("lag", max_delay=1.0, **settings)
 
 
+def make_loops(num_envs: int, **settings: Any) -> OuterLoops:
+    """The same, many."""
+    return OuterLoops("lag", num_envs, max_delay=1.0, **settings)
+
+
 def act(value: float) -> np.ndarray:
     return np.array([value], np.float32)
 
@@ -48,12 +52,25 @@ def episode(env: OuterLoop, seed: int | None, action: float = 0.2) -> list[tuple
     return seen
 
 
-@pytest.mark.parametrize("name", ["pitch", "heaters"])
+@pytest.mark.parametrize("name", ["Pitch", "Heaters"])
 def test_gymnasium_finds_no_fault(name: str) -> None:
-    spec = EnvSpec(
-        "OuterLoop-v0", entry_point=OuterLoop, kwargs={"plant": name}
-    )  # else it can't check close and render
-    check_env(gymnasium.make(spec).unwrapped)
+    check_env(gymnasium.make(f"jaxouter/{name}-v0").unwrapped)
+
+
+def test_settings_are_keywords_of_make() -> None:
+    env = gymnasium.make("jaxouter/Pitch-v0", tau=0.5, history=3)
+    assert env.observation_space.shape == (9,)
+    loops = gymnasium.make_vec("jaxouter/Pitch-v0", num_envs=2, tau=0.5, history=3)
+    assert loops.observation_space.shape == (2, 9)
+    assert isinstance(env.unwrapped, OuterLoop)
+    assert isinstance(loops, OuterLoops)
+    assert env.unwrapped.params.plant.tau == loops.params.plant.tau == 0.5
+
+
+def test_an_id_with_the_module_needs_no_import() -> None:
+    code = "import gymnasium; env = gymnasium.make('jaxouter.deploy.gymnasium:jaxouter/Heaters-v0'); print(env.spec.id)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "jaxouter/Heaters-v0\n"
 
 
 def test_it_is_the_functional_environment() -> None:
@@ -156,17 +173,121 @@ def test_observations_are_the_callers() -> None:
 def test_action_that_does_not_fit(action: np.ndarray) -> None:
     env = make()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"one finite number in an array of shape \(1,\)"):
+    with pytest.raises(ValueError, match=r"finite numbers in an array of shape \(1,\)"):
         env.step(action)
 
 
+@pytest.mark.parametrize("actions", [np.zeros(2), np.zeros((3, 1)), np.array([[0.0], [np.nan]])])
+def test_actions_that_do_not_fit(actions: np.ndarray) -> None:
+    loops = make_loops(2)
+    loops.reset(seed=0)
+    with pytest.raises(ValueError, match=r"finite numbers in an array of shape \(2, 1\)"):
+        loops.step(actions)
+
+
+def test_loops_that_cannot_be() -> None:
+    with pytest.raises(ValueError, match="num_envs is 0; it must be at least 1"):
+        make_loops(0)
+    with pytest.raises(ValueError, match="seed has 3 elements; it must be one number or one for each of 2"):
+        make_loops(2).reset(seed=[0, 1, 2])
+
+
+@pytest.mark.parametrize("kind", [OuterLoop, OuterLoops])
+def test_there_is_nothing_to_render(kind: Any) -> None:
+    kind("lag", render_mode=None)
+    with pytest.raises(TypeError, match="render_mode is 'rgb_array'; there is nothing to render, so it must be None"):
+        kind("lag", render_mode="rgb_array")
+
+
 def test_step_before_reset() -> None:
-    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
-        make().step(act(0.0))
+    for env, action in ((make(), np.zeros(1)), (make_loops(2), np.zeros((2, 1)))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+            env.step(action)
 
 
 def test_resets_are_left_to_the_caller() -> None:
     assert OuterLoop.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.DISABLED
+
+
+def same(got: Any, expected: Any) -> None:
+    """Equal in keys, shapes, dtypes and, but for rounding, values; rows of object arrays too."""
+    if isinstance(expected, dict):
+        assert set(got) == set(expected)
+        for name in expected:
+            same(got[name], expected[name])
+    elif expected is None:
+        assert got is None
+    else:
+        assert (got.shape, got.dtype) == (expected.shape, expected.dtype)
+        if expected.dtype == object:
+            for pair in zip(got, expected, strict=True):
+                same(*pair)
+        else:
+            np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("settings", [{"randomise": True}, {"K": 20.0}], ids=["truncated", "terminated"])
+def test_loops_are_gymnasiums_synchronous_ones(settings: dict[str, Any]) -> None:
+    loops, modes = make_loops(3, **settings), gymnasium.vector.AutoresetMode
+    single = gymnasium.vector.SyncVectorEnv([lambda: make(**settings)] * 3, autoreset_mode=modes.SAME_STEP)
+    for name in ("observation_space", "action_space", "single_observation_space", "single_action_space", "metadata"):
+        assert getattr(loops, name) == getattr(single, name)
+    rng, ended = np.random.default_rng(0), []
+    for seed in (7, None, [3, None, 4]):  # 7: loop i has 7 + i
+        same(
+            dict(zip("oi", loops.reset(seed=seed), strict=True)), dict(zip("oi", single.reset(seed=seed), strict=True))
+        )
+        for _ in range(53):
+            actions = rng.uniform(0.2, 1.0, (3, 1)).astype(np.float32) * [[1.0], [1.0], [0.01]]
+            got, expected = loops.step(actions), single.step(actions)
+            same(dict(zip("ortui", got, strict=True)), dict(zip("ortui", expected, strict=True)))
+            ended.append(got[2] | got[3])
+    assert np.any(ended, axis=0).sum() >= 2
+    assert settings == {"randomise": True} or any(0 < each.sum() < 3 for each in ended)  # not all at once
+
+
+def test_loops_end_where_the_plant_says() -> None:
+    loops = gymnasium.make_vec("jaxouter/Heaters-v0", num_envs=4, vectorization_mode="vector_entry_point")
+    assert isinstance(loops, OuterLoops)
+    steps = loops.functional.plant.episode_steps
+    obs, first = loops.reset(seed=0)
+    assert len(set(first["r"])) == len(set(first["y"])) == 4
+    for k in range(1, steps + 1):
+        before = obs
+        obs, _, terminated, truncated, infos = loops.step(np.zeros((4, 1)))
+        assert not terminated.any()
+        assert truncated.tolist() == [k == steps] * 4
+        assert ("final_obs" in infos) == (k == steps)
+    final = np.stack(infos["final_obs"])
+    assert all(each in loops.single_observation_space for each in final)
+    np.testing.assert_array_equal(infos["final_info"]["r"], first["r"])
+    np.testing.assert_allclose(final[:, 0], before[:, 0])  # of the same set-point, when obs is of the next
+    assert not np.any(np.isclose(final[:, 0], obs[:, 0]))
+    assert np.all(infos["r"] != first["r"])
+
+
+def test_loops_are_of_the_seed() -> None:
+    def run(seed: int | None) -> list[np.ndarray]:
+        start = loops.reset(seed=seed)[0]
+        return [start] + [loops.step(np.full((2, 1), 0.3))[0] for _ in range(60)]  # into the second episode
+
+    loops = make_loops(2)
+    one, two, again = run(1), run(2), run(1)
+    np.testing.assert_array_equal(one, again)
+    np.testing.assert_array_equal(np.stack(one)[:50, 1], np.stack(two)[:50, 0])  # seed 1 + 1
+    loops = make_loops(2)
+    assert not np.array_equal(run(None)[0], run(None)[0])
+
+
+def test_loops_count_as_gymnasium_counts() -> None:
+    loops = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_loops(2))
+    loops.reset(seed=0)
+    total = np.zeros(2)
+    for _ in range(50):
+        _, reward, _, _, infos = loops.step(np.full((2, 1), 0.3))
+        total += reward
+    assert infos["episode"]["l"].tolist() == [50, 50]
+    np.testing.assert_allclose(infos["episode"]["r"], total)
 
 
 def test_without_gymnasium_the_extra_is_named() -> None:

@@ -293,15 +293,15 @@ def test_file_whose_annotations_are_strings_can_be_imported(tmp_path):
     """Dataclasses look for them in `sys.modules`."""
     path = tmp_path / "own.py"
     path.write_text("from __future__ import annotations\n" + OWN.strip())
-    assert board.load_class(path, "Jax")(lag.LAG).bounds == (-4.0, 4.0)
+    assert board.attribute(path, "Jax", board.OWN)(lag.LAG).bounds == (-4.0, 4.0)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
-        ("absent.py", None, "absent.py is not a file; a policy of your own is named FILE.py:CLASS"),
-        ("own.txt", "x = 1", "own.txt is not a Python file; a policy of your own is named FILE.py:CLASS"),
-        ("own.py", "x = 1", "own.py has no class 'Own'"),
+        ("absent.py", None, "absent.py is not a Python file; a policy of your own is named FILE.py:NAME"),
+        ("own.txt", "x = 1", "own.txt is not a Python file; a policy of your own is named FILE.py:NAME"),
+        ("own.py", "x = 1", "own.py has no 'Own'"),
         ("own.py", "class Own", "own.py can't be imported: SyntaxError: "),
         ("own.py", "1 / 0", "own.py can't be imported: ZeroDivisionError: division by zero"),
         ("own.py", "import no_such_thing", "own.py can't be imported: ModuleNotFoundError: "),
@@ -311,13 +311,13 @@ def test_file_without_the_class_is_named(tmp_path, name, content, text):
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises(ValueError) as error:
-        board.load_class(tmp_path / name, "Own")
+        board.attribute(tmp_path / name, "Own", board.OWN)
     assert text in str(error.value)
 
 
 def test_folder_is_no_file_of_a_policy(tmp_path):
-    with pytest.raises(ValueError, match="is not a file"):
-        board.load_class(tmp_path, "Own")
+    with pytest.raises(ValueError, match="is not a Python file"):
+        board.attribute(tmp_path, "Own", board.OWN)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import counterfactual, identify
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.pretraining import ADAM, Teacher, Whitening
-from jaxouter.training.run import DamagedWarning, Run
+from jaxouter.training.run import Run, RunWarning
 from jaxouter.training.train import train
 from jaxouter.training.trainer import build
 from tests import lag
@@ -145,7 +145,7 @@ def test_a_damaged_first_checkpoint_is_made_again(config, tmp_path):
     finals = train(run)
     (path,) = run.checkpoints(0).values()
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.warns(DamagedWarning, match=r"checkpoint-000000\.npz is not a readable checkpoint"):
+    with pytest.warns(RunWarning, match=r"checkpoint-000000\.npz is not a readable checkpoint"):
         resumed = train(Run.open(run.path))
     chex.assert_trees_all_equal(finals, resumed)
 
@@ -155,7 +155,7 @@ def test_a_damaged_start_begins_anew(config, tmp_path):
     train(run, stop=lambda: True)
     path = run.seed_folder(0) / "pretraining.npz"
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.warns(DamagedWarning, match=r"pretraining\.npz is not a readable checkpoint"):
+    with pytest.warns(RunWarning, match=r"pretraining\.npz is not a readable checkpoint"):
         train(run, pretrained=lambda seed, done: heard.append(done))
     assert heard == [50, 100]
 

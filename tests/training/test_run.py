@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxouter.training import checkpoint
-from jaxouter.training.run import KEEP, DamagedWarning, Run
+from jaxouter.training.run import KEEP, Run, RunWarning
 from jaxouter.training.train import NotFiniteError, Pace, train
 from tests.precision import FLOAT, makes_nan
 from tests.training.small import small
@@ -99,9 +99,9 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(tmp_pat
     train(damaged, stop=iter([False, True]).__next__)
     path = damaged.seed_folder(0) / "checkpoint-000002.npz"
     path.write_bytes(DAMAGE[damage](path.read_bytes()))
-    with pytest.warns(DamagedWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
+    with pytest.warns(RunWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
         assert damaged.load(0)[1] == 1
-    with pytest.warns(DamagedWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
+    with pytest.warns(RunWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
         resumed = train(Run.open(damaged.path))
     chex.assert_trees_all_equal(finals, resumed)
     assert rows_without_times(whole, 0) == rows_without_times(damaged, 0)
@@ -112,7 +112,7 @@ def test_where_every_checkpoint_is_damaged_nothing_starts_over_by_itself(tmp_pat
     train(run)
     for path in run.checkpoints(0).values():
         path.write_bytes(b"")
-    with pytest.warns(DamagedWarning), pytest.raises(ValueError, match="no whole checkpoint"):
+    with pytest.warns(RunWarning), pytest.raises(ValueError, match="no whole checkpoint"):
         train(run)
     assert len(run.checkpoints(0)) == KEEP
 

@@ -1,0 +1,47 @@
+"""The controller as StableHLO, serialised by `jax.export`: callable from JAX without this package.
+
+    act = jax.export.deserialize(bytearray(path.read_bytes())).call
+    r_tilde, y_past, r_tilde_past, integral = act(r, y, y_past, r_tilde_past, integral)
+
+All are float32. Before the first step y_past (H,) is filled with the first y, r_tilde_past (H,) with that y clipped to
+the bounds of r~, and integral is 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+from jax import export
+
+from jaxouter.loop.observation import Memory
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+
+try:
+    import flatbuffers  # noqa: F401
+except ImportError as error:
+    raise ImportError("jax.export needs FlatBuffers to write files: pip install flatbuffers") from error
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
+
+def exported(policy: LearnedPolicy, params: LearnedParams) -> export.Exported:
+    """`policy.act` with its numbers inside, for each of `PLATFORMS`."""
+    numbers = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), params)
+
+    def outer_loop(
+        r: jax.Array, y: jax.Array, y_past: jax.Array, r_tilde_past: jax.Array, integral: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        memory, r_tilde = policy.act(numbers, Memory(y_past, r_tilde_past, integral), r, y)
+        return r_tilde, memory.y_past, memory.r_tilde_past, memory.integral
+
+    number = jax.ShapeDtypeStruct((), np.float32)
+    past = jax.ShapeDtypeStruct((policy.observer.history,), np.float32)
+    with jax.default_matmul_precision("highest"):  # else GPUs and TPUs round what they multiply
+        return export.export(jax.jit(outer_loop), platforms=PLATFORMS)(number, number, past, past, number)
+
+
+def save(policy: LearnedPolicy, params: LearnedParams, path: Path) -> None:
+    """Write what `jax.export.deserialize` reads."""
+    path.write_bytes(exported(policy, params).serialize())

@@ -1,0 +1,154 @@
+"""`python -m jaxouter.export`: the controller that a run has learned, as a file for other tools."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxouter import cli
+from jaxouter.deploy import c, fmu, verify
+from jaxouter.deploy.law import Law
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+from jaxouter.training.run import open_run
+
+FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Export the controller that a run has learned: history, scaling, network and bounds, with its state explicit.
+
+    --format may be: onnx (a graph; needs the extra onnx), npz (the numbers, for jaxouter.deploy.law, which is NumPy),
+    stablehlo (for jax.export), c (C99 without memory allocation: a .c and a .h file) or fmu (FMI 2.0 co-simulation;
+    needs a C compiler). The file is run beside the policy before it is put in its place.
+    """
+
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Run folder (its median seed is exported), or the folder of one seed in it."""
+    format: str | None = None
+    """onnx, npz, stablehlo, c or fmu."""
+    out: Path | None = None
+    """File to write, which must not exist; default: controller.FORMAT in the folder."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    with cli.user_errors():
+        options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
+        run_path, kind, out = check(options)
+        run, seed, _ = open_run(run_path)
+        cli.use_compilation_cache()
+        state, _ = run.load(seed)
+    trainer, _ = run.trainer
+    policy, params = trainer.policy, trainer.policy_params(state)
+    law = Law.of(policy, params, trainer.env.plant)
+    with tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent) as place:
+        made = Path(place) / out.name
+        write(kind, made, law, policy, params)
+        found = verified(kind, made, law, policy, params)
+        for path in written(kind, made):
+            path.replace(out.with_name(path.name))
+    low, high = law.r_tilde_bounds
+    print(
+        f"{law.plant}, seed {seed}: r~ in [{low:g}, {high:g}] {law.y_unit} from r and y in {law.y_unit}, once every "
+        f"{law.control_step:g} {law.time_unit}; state: {law.history} past y, {law.history} past r~, integral"
+    )
+    for path in written(kind, out):
+        print(f"written: {path} ({path.stat().st_size / 1000:.1f} kB)")
+    print(found)
+
+
+def check(options: Options) -> tuple[Path, str, Path]:
+    """Everything that can be wrong and found without work.
+
+    Returns:
+        Folder of the run, format, and the file to write.
+
+    Raises:
+        ValueError: the options name what does not exist, what exists already, or what can't be made here.
+    """
+    kind, run = options.format, options.run
+    if run is None:
+        raise ValueError("say what to export: a run folder, or the folder of one seed in it")
+    if kind not in FORMATS:
+        asked = "say --format" if kind is None else f"there is no format {kind!r}"
+        raise ValueError(f"{asked}; the formats are: {', '.join(FORMATS)}")
+    out = run / f"controller.{kind}" if options.out is None else options.out
+    open_run(run)
+    if out.suffix != f".{kind}":
+        raise ValueError(f"--out is {out}; for the format {kind} its name must end in .{kind}")
+    for path in written(kind, out):
+        if path.exists():
+            raise ValueError(f"{path} exists; remove it, or choose another --out")
+    if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
+        raise ValueError(f"{out} can't be written: {out.parent} must be a folder that you may write to")
+    try:
+        needed(kind)
+    except (ImportError, FileNotFoundError) as error:
+        raise ValueError(f"--format {kind} can't be made here: {error}") from None
+    return run, kind, out
+
+
+def written(kind: str, out: Path) -> list[Path]:
+    """The files that an export consists of."""
+    return [out, out.with_suffix(".h")] if kind == "c" else [out]
+
+
+def needed(kind: str) -> None:
+    """Raises ImportError or FileNotFoundError where what makes a format is not installed."""
+    if kind == "onnx":
+        from jaxouter.deploy import onnx  # noqa: F401
+    elif kind == "stablehlo":
+        from jaxouter.deploy import stablehlo  # noqa: F401
+    elif kind == "fmu":
+        c.compiler()
+        fmu.platform_folder()
+
+
+def write(kind: str, path: Path, law: Law, policy: LearnedPolicy, params: LearnedParams) -> None:
+    """Write the controller in a format."""
+    match kind:
+        case "onnx":
+            from jaxouter.deploy import onnx
+
+            onnx.save(law, path)
+        case "npz":
+            law.save(path)
+        case "stablehlo":
+            from jaxouter.deploy import stablehlo
+
+            stablehlo.save(policy, params, path)
+        case "c":
+            c.save(law, path)
+        case "fmu":
+            fmu.save(law, path)
+
+
+def verified(kind: str, path: Path, law: Law, policy: LearnedPolicy, params: LearnedParams) -> str:
+    """What running the file showed, in a line.
+
+    Raises:
+        SystemExit: it is not what the policy does.
+    """
+    try:
+        found = verify.verify(kind, path, law, policy, params)
+    except (ImportError, FileNotFoundError) as error:
+        return f"not verified: {error}"
+    text = (
+        f"{found.at_a_step:.1e} of the range of r~ at a step and {found.in_closed_loop:.1e} in closed loop are the "
+        f"largest deviations from the policy in {verify.STEPS:,} steps"
+    )
+    if not found.small:
+        allowed = f"{verify.AT_A_STEP:.0e} and {verify.IN_CLOSED_LOOP:.0e}"
+        raise SystemExit(f"error: nothing is written: {text}; allowed are {allowed}")
+    return f"verified: {text}"
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,146 @@
+"""Plants by reference: what a command line may name in place of `pitch` or `heaters`.
+
+`FILE.py:NAME` is a plant of one's own, in a file: a function that returns the plant and its parameters, as
+`jaxouter.plants.pitch.make` does. An installed package may offer one as an entry point of the group `jaxouter.plants`.
+`gym:ID` and `fmu:FILE` are simulated elsewhere.
+
+A plant is imported only because a command line names it, never because a run folder does. It is then known by a short
+name, in scenarios (`Tank/steps`) and in folders (`runs/Tank-default-0`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, wraps
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxouter import plants
+from jaxouter.plants import contract, simulators
+from jaxouter.plants.base import Plant
+from jaxouter.plants.simulators import PlantOptions
+
+GROUP = "jaxouter.plants"  # of entry points
+FORMS = "FILE.py:NAME, gym:ID, fmu:FILE"
+
+
+class Source(NamedTuple):
+    """Where a plant comes from."""
+
+    reference: str
+    options: PlantOptions
+    sha256: str  # of its file
+
+
+SOURCES: dict[str, Source] = {}
+"""By the short name, of all plants that were added."""
+
+
+def attribute(path: Path, name: str, what: str) -> Any:
+    """What a Python file of the user's calls `name`; `what` it is to be is said where it isn't there.
+
+    Raises:
+        ValueError: there is no such file or name, or the file can't be imported.
+    """
+    spec = importlib.util.spec_from_file_location(f"jaxouter_user_{path.stem}", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file; {what} is named FILE.py:NAME")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
+    if not hasattr(module, name):
+        raise ValueError(f"{path} has no {name!r}")
+    return getattr(module, name)
+
+
+def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa: B008 - frozen
+    """Make the plant that a command line names known, and give its short name, by which `plants.make` finds it.
+
+    Raises:
+        ValueError: there is none, it breaks the contract, or its short name is another plant's.
+    """
+    if reference in plants.REGISTRY and reference not in SOURCES:
+        _plain(reference, options)
+        return reference
+    name, make, path = _find(reference, options)
+    source = Source(reference, options, hashlib.sha256(path.read_bytes()).hexdigest())
+    if SOURCES.get(name, source) != source or (name in plants.REGISTRY and name not in SOURCES):
+        other = SOURCES[name].reference if name in SOURCES else "a built-in plant"
+        raise ValueError(f"{reference} has the short name {name!r}, which is that of {other}; rename it")
+    if name not in SOURCES:
+        try:
+            made = make()
+            plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
+            contract.shapes(plant, params)
+        except ValueError as error:
+            raise ValueError(f"{reference}: {error}") from error
+        except Exception as error:
+            raise ValueError(f"{reference} can't be made: {type(error).__name__}: {error}") from error
+        plants.REGISTRY[name] = make
+        SOURCES[name] = source
+    return name
+
+
+def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tuple[Plant, Any]], Path]:
+    """Short name, maker and file of a plant."""
+    kind, _, rest = reference.partition(":")
+    if kind == "gym":
+        name = _short(rest.rpartition("/")[2])
+        return name, cache(lambda: simulators.from_gymnasium(name, rest, options)), simulators.file_of(rest)
+    if kind == "fmu":
+        name, path = _short(Path(rest).stem), Path(rest)
+        if not path.is_file():
+            raise ValueError(f"{reference}: there is no file {rest}")
+        return name, cache(lambda: simulators.from_fmu(name, path, options)), path
+    _plain(reference, options)
+    file, colon, name = reference.rpartition(":")
+    if colon and file.endswith(".py"):
+        return name, _named(name, attribute(Path(file), name, "a plant of your own")), Path(file)
+    offered = list(entry_points(group=GROUP, name=reference))
+    if not offered:
+        known = [*plants.REGISTRY, *(point.name for point in entry_points(group=GROUP))]
+        raise ValueError(f"there is no plant {reference!r}; the plants are: {', '.join(known)}, and {FORMS}")
+    make = offered[0].load()
+    return reference, _named(reference, make), Path(inspect.getsourcefile(make) or "")
+
+
+def _plain(reference: str, options: PlantOptions) -> None:
+    if options != PlantOptions():
+        raise ValueError(f"{reference} declares itself; options such as --y-index and --input are for gym: and fmu:")
+
+
+def _short(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text) or "plant"
+
+
+def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., tuple[Plant, Any]]:
+    """The same maker, whose plant has this name: one that equals itself, however often it is made."""
+    if not callable(make):
+        raise ValueError(f"{name} is {make!r}; it must be a function that returns a plant and its parameters")
+
+    @cache
+    def known(plant: Plant) -> Plant:
+        return replace(plant, name=name)
+
+    @cache
+    def made() -> Any:
+        return make()
+
+    @wraps(make)
+    def named(**overrides: Any) -> Any:
+        found = make(**overrides) if overrides else made()
+        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Plant):
+            return known(found[0]), found[1]
+        return found
+
+    return named
