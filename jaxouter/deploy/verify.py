@@ -80,7 +80,7 @@ def signals(law: Law, policy: LearnedPolicy, params: LearnedParams, steps: int =
     r, y = r.astype(np.float32), y.astype(np.float32)
     with jax.default_matmul_precision("highest"):
         memory, r_tilde = jax.device_get(_record(policy, params, jnp.asarray(r, float), jnp.asarray(y, float)))
-    return Signals(r, y, State(*(np.asarray(leaf, np.float32) for leaf in memory)), r_tilde)
+    return Signals(r, y, State(*jax.tree.map(np.float32, tuple(memory))), r_tilde)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -96,7 +96,7 @@ def deviation(controller: Controller, law: Law, seen: Signals) -> Deviation:
     """Of a controller from what the policy did, step by step in its state, and in a state of the controller's own."""
     state, got = controller.init(seen.y[0]), []
     for k, (r, y) in enumerate(zip(seen.r, seen.y, strict=True)):
-        _, at_a_step = controller.act(State(*(leaf[k] for leaf in seen.state)), r, y)
+        _, at_a_step = controller.act(jax.tree.map(lambda leaf, k=k: leaf[k], seen.state), r, y)
         state, in_closed_loop = controller.act(state, r, y)
         got.append((float(at_a_step), float(in_closed_loop)))
     low, high = law.r_tilde_bounds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import importlib
 import inspect
 import math
 import shutil
@@ -68,13 +69,16 @@ def _gymnasium() -> Any:
 
 
 def file_of(identifier: str) -> Path:
-    """The file that holds a Gymnasium environment's class.
+    """The file that holds a Gymnasium environment's class; an identifier may begin with a module, as in `make`.
 
     Raises:
         ValueError: Gymnasium is not there, or knows no such environment.
     """
     gymnasium = _gymnasium()
+    module, _, identifier = identifier.rpartition(":")
     try:
+        if module:
+            importlib.import_module(module)
         entry = gymnasium.spec(identifier).entry_point
         creator = gymnasium.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
     except (gymnasium.error.Error, ImportError, AttributeError) as error:
@@ -117,7 +121,8 @@ def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[P
         return gymnasium.make(identifier, max_episode_steps=-1, disable_env_checker=True)
 
     try:
-        limit, first = gymnasium.spec(identifier).max_episode_steps, make()
+        first = make()
+        limit = gymnasium.spec(identifier.rpartition(":")[2]).max_episode_steps
     except (gymnasium.error.Error, ImportError) as error:  # it may need packages that are not there
         raise ValueError(f"gym:{identifier}: {str(error).partition(chr(10))[0]}") from None
     action, observation = first.action_space, first.observation_space

@@ -95,7 +95,7 @@ def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tup
     """Short name, maker and file of a plant."""
     kind, _, rest = reference.partition(":")
     if kind == "gym":
-        name = _short(rest.rpartition("/")[2])
+        name = _short(re.split("[/:]", rest)[-1])
         return name, cache(lambda: simulators.from_gymnasium(name, rest, options)), simulators.file_of(rest)
     if kind == "fmu":
         name, path = _short(Path(rest).stem), Path(rest)

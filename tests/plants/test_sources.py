@@ -1,6 +1,7 @@
 """Plants of one's own, by reference."""
 
 import json
+from unittest.mock import patch
 
 import jax
 import numpy as np
@@ -13,14 +14,14 @@ from jaxouter.training.run import Run
 from tests.load import ROOT
 
 TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
-TINY = "--pretraining.gradient-steps 2 --pretraining.episodes 2 --ddpg.hidden 8 8".split()
+TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]
 
 
 @pytest.fixture(autouse=True)
-def forgotten(monkeypatch):
+def forgotten():
     """No plant that a test adds stays."""
-    monkeypatch.setattr(plants, "REGISTRY", dict(plants.REGISTRY))
-    monkeypatch.setattr(sources, "SOURCES", {})
+    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+        yield
 
 
 def test_a_plant_in_a_file_is_made_by_its_short_name():
@@ -39,8 +40,7 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
     kept = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (kept["config"]["plant"], kept["plant"]["reference"]) == ("Tanks", TANKS)
     evaluate.main(["run", "--plant", TANKS, "--scenario", "Tanks/steps", "--episodes", "2"])
-    monkeypatch.setattr(plants, "REGISTRY", {name: plants.REGISTRY[name] for name in ("pitch", "heaters")})
-    monkeypatch.setattr(sources, "SOURCES", {})
+    del plants.REGISTRY["Tanks"], sources.SOURCES["Tanks"]
     with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
         Run.open(tmp_path / "run")
 
@@ -114,7 +114,9 @@ def test_a_simulator_is_a_pure_plant():
 
 
 def test_a_gymnasium_environment_is_a_plant():
-    name = sources.add("gym:jaxouter/Pitch-v0", PlantOptions(y_index=1, setpoint_range=(-0.2, 0.2)))
+    name = sources.add(
+        "gym:jaxouter.deploy.gymnasium:jaxouter/Pitch-v0", PlantOptions(y_index=1, setpoint_range=(-0.2, 0.2))
+    )
     plant, params = plants.make(name)
     assert (name, plant.episode_steps, plant.r_tilde_bounds) == ("Pitch-v0", 200, (-1.0, 1.0))
     assert [what for what, wrong in contract.behaviour(plant, params) if wrong] == []
