@@ -150,6 +150,11 @@ def test_bounds_and_rate_limit(static):
     controller.disengage()
     assert run(controller, [0.0] * 2, r=-50.0) == [21.0, 17.0]
     assert run(controller, [0.0] * 9, r=-50.0)[-2:] == [-5.0, -5.0]
+    fading = Controller(static, bounds=(-5.0, 25.0), r_tilde=-5.0, transfer_steps=10)
+    assert run(fading, [0.0], r=5.0) == [-3.0]
+    fading.disengage()
+    assert run(fading, [0.0], r=20.0) == pytest.approx([-0.7])  # the difference is -23
+    assert run(fading, [0.0], r=-5.0) == [-5.0]
 
 
 @pytest.mark.parametrize(
@@ -212,17 +217,17 @@ def test_late_needs_two_times_and_time_may_go_back(static):
 def test_what_was_missed_is_remembered_as_the_last_sample(pitch):
     controller = Controller(pitch, return_after=1, transfer_steps=1, late_after=10.0)
     state, r_tilde = pitch.init(2.0), 0.0
-    for y, time in ((2.0, 0.0), (5.0, 0.1), (7.0, 0.4)):
-        missed = 2 if time == 0.4 else 0
+    y_before = 2.0
+    for y, time, missed in ((2.0, 0.0, 0), (5.0, 0.1, 0), (7.0, 0.3, 1), (8.0, 0.6, 2)):
         for _ in range(missed):
-            state = pitch.record(pitch.observe(state, 10.0, 5.0), 5.0, r_tilde)
+            state = pitch.record(pitch.observe(state, 10.0, y_before), y_before, r_tilde)
         state = pitch.observe(state, 10.0, y)
         r_tilde = controller.step(10.0, y, time)
         assert r_tilde == float(pitch.r_tilde(state, 10.0, y))
-        state = pitch.record(state, y, r_tilde)
-    controller.step(10.0, None, 0.5)
-    state = pitch.record(pitch.observe(state, 10.0, 7.0), 7.0, 10.0)
-    assert controller.step(10.0, 6.0, 0.6) == float(pitch.r_tilde(pitch.observe(state, 10.0, 6.0), 10.0, 6.0))
+        state, y_before = pitch.record(state, y, r_tilde), y
+    controller.step(10.0, None, 0.7)
+    state = pitch.record(pitch.observe(state, 10.0, 8.0), 8.0, 10.0)
+    assert controller.step(10.0, 6.0, 0.8) == float(pitch.r_tilde(pitch.observe(state, 10.0, 6.0), 10.0, 6.0))
 
 
 def test_a_wild_sample_is_remembered_within_the_range(pitch):
