@@ -16,6 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.plants import Plant
 
 matplotlib.use("agg")
 
@@ -219,4 +220,19 @@ def learning_curve(
     for axes in (left, right):
         axes.set_xlabel("environment steps [thousand]")
         axes.legend(fontsize=7.5, framealpha=0.85)
+    return save(figure, path)
+
+
+def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.ndarray) -> Path:
+    """What y does (n, T) after r~ has moved by so much (n,); and by that, where a linear plant has one line."""
+    unit, time = symbol(plant.y_unit), plant.control_step * np.arange(responses.shape[1] + 1)
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    for move, response in zip(moves, responses, strict=True):
+        style = dict(lw=1.2, ls="-" if move > 0 else "--", label=f"r̃ {move:+.3g} {unit}")
+        above.plot(time, [0.0, *response], **style)
+        below.plot(time, [0.0, *(response / move)], **style)
+    above.set(ylabel=f"change of y, {unit}", title=f"{plant.name}: response to a move of r̃ at 0")
+    below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
+    above.legend(fontsize=8, ncols=2)
     return save(figure, path)

@@ -1,0 +1,53 @@
+"""The check of a plant as users call it."""
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from jaxouter import check, plants
+from jaxouter.plants import sources
+from tests import lag
+from tests.load import ROOT
+
+TANKS = ROOT / "scripts" / "examples" / "tanks.py"
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    with patch.dict(plants.REGISTRY, lag=lag.make), patch.dict(sources.SOURCES):
+        yield
+
+
+def test_a_plant_that_keeps_the_contract(tmp_path, capsys):
+    figure = tmp_path / "steps.png"
+    check.main([f"{TANKS}:Tanks", "--figure", str(figure)])
+    out = capsys.readouterr().out
+    assert out.count("kept") == 5
+    assert "DC gain" in out
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_dead_time_and_gain_of_the_lag():
+    plant, params = lag.make(K=0.5, d=0.3)
+    moves, responses = check.step_responses(plant, params)
+    assert check.dead_time(responses) == 3
+    np.testing.assert_allclose(responses[:, -1] / moves, 0.5, rtol=1e-3)
+
+
+def test_what_is_not_pure_is_found_and_ends_with_status_1(tmp_path, capsys):
+    source = TANKS.read_text().replace(
+        "return state.lower\n", "return jnp.where(state.lower > 15.0, jnp.nan, state.lower)\n"
+    )
+    (tmp_path / "own.py").write_text(source)
+    with pytest.raises(SystemExit) as end:
+        check.main([f"{tmp_path}/own.py:Tanks", "--figure", str(tmp_path / "steps.png")])
+    assert end.value.code in (1, 2)
+    assert "control steps" in capsys.readouterr().out
+
+
+def test_mistakes_are_said(capsys):
+    with pytest.raises(SystemExit) as end:
+        check.main(["nothing"])
+    assert end.value.code == 2
+    assert "there is no plant 'nothing'" in capsys.readouterr().err
