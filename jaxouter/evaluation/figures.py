@@ -234,5 +234,5 @@ def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.nd
         below.plot(time, [0.0, *(response / move)], **style)
     above.set(ylabel=f"change of y, {unit}", title=f"{plant.name}: response to a move of r̃ at 0")
     below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
-    above.legend(fontsize=8, ncols=2)
+    above.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return save(figure, path)
