@@ -111,7 +111,9 @@ def plant(make: Callable[[], Simulator], **declared: Any) -> tuple[Plant, tuple[
 
     def init(key: chex.PRNGKey, params: Any) -> HostState:
         del params
-        return HostState(*jax.pure_callback(begin, result, jax.random.bits(key), vmap_method="sequential"))
+        return HostState(
+            *jax.pure_callback(begin, result, jax.random.bits(key, (), jnp.uint32), vmap_method="sequential")
+        )
 
     def step(params: Any, state: HostState, r_tilde: jax.Array, key: chex.PRNGKey) -> HostState:
         del params, key
