@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -22,6 +23,13 @@ def results_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Results of rivals are made anew: their cache does not know of the plants in the tests."""
     os.environ["MPLCONFIGDIR"] = matplotlib.get_cachedir()  # else matplotlib would search all fonts again
     os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_executables() -> Iterator[None]:
+    """A module's compiled functions go when it ends: with those of the whole suite in one process XLA has crashed."""
+    yield
+    jax.clear_caches()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
