@@ -216,9 +216,9 @@ def place(tmp_path, monkeypatch):
         (["submarine"], "there is no plant 'submarine'; the plants are: pitch, heaters"),
         (["--policy", "best"], "there is no policy 'best'; it may be FILE.py:CLASS or one of: none, static, pi, mpc"),
         (["--policy", "lead.py"], "there is no policy 'lead.py'; it may be FILE.py:CLASS"),
-        (["--policy", "nowhere.py:Lead"], "nowhere.py is not a file; a policy of your own is named FILE.py:CLASS"),
-        (["--policy", "lead.py:Lag"], "lead.py has no class 'Lag'"),
-        (["--policy", "empty.py:Lead"], "empty.py has no class 'Lead'"),
+        (["--policy", "nowhere.py:Lead"], "nowhere.py is not a Python file; a policy of your own is named FILE.py:NAME"),
+        (["--policy", "lead.py:Lag"], "lead.py has no 'Lag'"),
+        (["--policy", "empty.py:Lead"], "empty.py has no 'Lead'"),
         (["--policy", "fails.py:Lead"], "fails.py can't be imported: ZeroDivisionError: division by zero"),
         (["--scenario", "pitch/papers"], "there is no scenario 'pitch/papers'; pitch has: pitch/paper, "),
         (["--scenario", "boat/paper"], "there is no plant 'boat'"),
@@ -273,7 +273,7 @@ class Broken:
 def test_bad_input_leaves_no_traceback(tmp_path):
     done = command("--policy", f"{LEAD}:Lag", cwd=tmp_path, cache=tmp_path / "cache")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"error: {LEAD} has no class 'Lag'\n"
+    assert done.stderr == f"error: {LEAD} has no 'Lag'\n"
     assert list(tmp_path.iterdir()) == []
 
 
