@@ -216,7 +216,10 @@ def place(tmp_path, monkeypatch):
         (["submarine"], "there is no plant 'submarine'; the plants are: pitch, heaters"),
         (["--policy", "best"], "there is no policy 'best'; it may be FILE.py:CLASS or one of: none, static, pi, mpc"),
         (["--policy", "lead.py"], "there is no policy 'lead.py'; it may be FILE.py:CLASS"),
-        (["--policy", "nowhere.py:Lead"], "nowhere.py is not a Python file; a policy of your own is named FILE.py:NAME"),
+        (
+            ["--policy", "nowhere.py:Lead"],
+            "nowhere.py is not a Python file; a policy of your own is named FILE.py:NAME",
+        ),
         (["--policy", "lead.py:Lag"], "lead.py has no 'Lag'"),
         (["--policy", "empty.py:Lead"], "empty.py has no 'Lead'"),
         (["--policy", "fails.py:Lead"], "fails.py can't be imported: ZeroDivisionError: division by zero"),
