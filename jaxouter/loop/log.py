@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,10 +22,10 @@ JITTER = 1e-3  # by which a step may differ from the others, as share of it
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 EACH = 8  # rows that a coefficient takes at least
 DEAD_TIMES = 40  # control steps, the longest that is tried
-STRIDE = 4  # with which dead times are searched at first
-PATIENCE = 2  # orders that may be no better before the search ends
+STRIDE = 4  # with which dead times are searched at first, or half of the order
+FINE = 8  # order up to which a dead time is told to a step; beyond, b covers what lies between
 LONGEST = 2_000  # rows of each third by which order and dead time are chosen
-PARSIMONY = 1e-3  # error of the free run, as share of the standard deviation of y, that a smaller order may cost
+PARSIMONY = 3e-3  # error of the free run, as share of the standard deviation of y, that a smaller order may cost
 BAND = 0.05  # of the step, for the settling time
 AGREE = 0.9  # of the members must be able to hold a set-point
 
@@ -218,12 +218,10 @@ def choose(log: Log) -> tuple[int, int]:
     most, slack = min(DEAD_TIMES, third // 4), PARSIMONY * float(np.std(log.y))
     errors: dict[int, dict[int, float]] = {}  # by order, then dead time
     for n in (n for n in ORDERS if n == 1 or EACH * (2 * n + 1) <= 2 * third):
-        of_n = errors[n] = {dead: _error(log, rows, n, dead) for dead in range(0, most + 1, STRIDE)}
-        _look_near(min(of_n, key=lambda dead: of_n[dead]), of_n, most, lambda dead, n=n: _error(log, rows, n, dead))
-        best = [min(each.values()) for each in errors.values()]
-        if len(best) > PATIENCE and min(best[-PATIENCE:]) > 0.99 * min(best[:-PATIENCE]) - slack:
-            break
-    enough = 1.01 * min(best) + slack
+        of_n = errors[n] = {dead: _error(log, rows, n, dead) for dead in range(0, most + 1, max(STRIDE, n // 2))}
+        _look_near(min(of_n, key=lambda dead: of_n[dead]), log, rows, n, of_n, most)
+    best = min(min(of_n.values()) for of_n in errors.values())
+    enough = 1.01 * best + slack
     if not math.isfinite(enough):
         raise ValueError(
             "every model of this log is unstable; r~ must move a loop that comes to rest by itself, and the log must "
@@ -231,14 +229,15 @@ def choose(log: Log) -> tuple[int, int]:
         )
     n = next(n for n, of_n in errors.items() if min(of_n.values()) <= enough)
     late = max(dead for dead, error in errors[n].items() if error <= enough)
-    _look_near(late, errors[n], most, lambda dead: _error(log, rows, n, dead))
+    _look_near(late, log, rows, n, errors[n], most)
     return n, max(dead for dead, error in errors[n].items() if error <= enough)
 
 
-def _look_near(dead: int, errors: dict[int, float], most: int, error: Callable[[int], float]) -> None:
+def _look_near(dead: int, log: Log, rows: np.ndarray, n: int, errors: dict[int, float], most: int) -> None:
     """Adds the errors of the dead times that the stride has left out beside this one."""
-    for each in range(max(0, dead - STRIDE + 1), min(most, dead + STRIDE - 1) + 1):
-        errors[each] = errors[each] if each in errors else error(each)
+    for each in range(max(0, dead - STRIDE + 1), min(most, dead + STRIDE - 1) + 1) if n <= FINE else ():
+        if each not in errors:
+            errors[each] = _error(log, rows, n, each)
 
 
 def _error(log: Log, rows: np.ndarray, n: int, dead: int) -> float:
@@ -256,8 +255,8 @@ def _error(log: Log, rows: np.ndarray, n: int, dead: int) -> float:
 def ensemble(log: Log, members: int = 16, seed: int = 0, shape: tuple[int, int] | None = None) -> Ensemble:
     """Models of the log: the nominal one of all rows, and those of resampled rows (moving block bootstrap).
 
-    The blocks are twice as long as the nominal model remembers, where there are eight of them. A member takes the dead
-    time, the nominal one or a step beside it, that fits its rows best. Unstable ones are drawn again.
+    The blocks are twice as long as the nominal model remembers, where there are eight of them. A member of a low order
+    takes the dead time, the nominal one or a step beside it, that fits its rows best. Unstable ones are drawn again.
 
     Args:
         log: what is fitted.
@@ -281,7 +280,7 @@ def ensemble(log: Log, members: int = 16, seed: int = 0, shape: tuple[int, int] 
         )
     lead = n + dead
     block = min(max(2 * settling(nominal), 2 * lead), (len(rows) - lead) // 8)
-    late = range(max(0, dead - 1), dead + 2)
+    late = range(max(0, dead - 1), dead + 2) if n <= FINE else (dead,)
     found, redrawn = [], 0
     while len(found) < members:
         first = rng.integers(0, len(rows) - lead - block, (math.ceil((len(rows) - lead) / block), 1))

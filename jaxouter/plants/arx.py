@@ -13,22 +13,20 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from jaxouter.plants.base import Plant
 
 
 class Model(NamedTuple):
-    """One model; each with a leading axis in an ensemble."""
+    """One model, of JAX or NumPy numbers; each with a leading axis in an ensemble."""
 
-    a: jax.Array  # (n,)
-    b: jax.Array  # (m,)
-    c: jax.Array
-    sigma: jax.Array  # standard deviation of e
+    a: Any  # (n,)
+    b: Any  # (m,)
+    c: Any
+    sigma: Any  # standard deviation of e
 
 
-@struct.dataclass
-class ARXParams:
+class ARXParams(NamedTuple):
     """Parameters of the plant; every array is traced."""
 
     model: Model  # that acts
@@ -51,7 +49,9 @@ def make(nominal: Model, members: Sequence[Model], **declared: Any) -> tuple[Pla
         members: what may be drawn; each of the shapes of the nominal one.
         **declared: fields of `Plant`.
     """
-    plant = Plant(init=init, step=step, output=output, start=start, draw=draw, noise_free=noise_free, **declared)
+    plant = Plant(
+        init=init, step=step, output=output, start=start, draw=draw, noise_free=noise_free, identified=True, **declared
+    )
     gain, offset = np.sum(nominal.b) / (1.0 - np.sum(nominal.a)), nominal.c / (1.0 - np.sum(nominal.a))
     held = np.clip((np.array(plant.setpoint_range) - offset) / gain, *plant.r_tilde_bounds)
     model, *each = (jax.tree.map(lambda leaf: jnp.asarray(leaf, float), one) for one in (nominal, *members))
@@ -81,7 +81,7 @@ def start(key: chex.PRNGKey, params: ARXParams) -> ARXState:
 def draw(key: chex.PRNGKey, params: ARXParams) -> ARXParams:
     """One of the ensemble acts."""
     member = jax.random.randint(key, (), 0, params.ensemble.c.shape[0])
-    return params.replace(model=jax.tree.map(lambda leaf: leaf[member], params.ensemble))
+    return params._replace(model=jax.tree.map(lambda leaf: leaf[member], params.ensemble))
 
 
 def output(params: ARXParams, state: ARXState) -> jax.Array:
@@ -102,4 +102,4 @@ def step(params: ARXParams, state: ARXState, r_tilde: jax.Array, key: chex.PRNGK
 def noise_free(params: ARXParams) -> ARXParams:
     """The same models without e."""
     model, ensemble = (one._replace(sigma=jnp.zeros_like(one.sigma)) for one in (params.model, params.ensemble))
-    return params.replace(model=model, ensemble=ensemble)
+    return params._replace(model=model, ensemble=ensemble)
