@@ -256,7 +256,7 @@ def _held_out(axes: Axes, report: Report, unit: str, time_unit: str) -> None:
     axes.set_xlabel(f"time [{time_unit}]")
     axes.set_xlim(t[0], t[-1])
     told = f"{max(report.fit_free_run, 0.0):.1%} of the variance, {report.coverage:.0%} in the band"
-    axes.set_title(f"rows that no model has seen: {told}", fontsize=10, loc="left")
+    axes.set_title(f"rows not fitted: {told}", fontsize=10, loc="left")
     axes.legend(fontsize=7.5, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
 
 

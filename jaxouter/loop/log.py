@@ -39,8 +39,8 @@ class Log(NamedTuple):
 
     @property
     def step(self) -> float:
-        """The control step."""
-        return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+        """The control step, without the last digits of the times."""
+        return float(f"{(self.time[-1] - self.time[0]) / (len(self.time) - 1):.9g}")
 
     def rows(self, first: int, end: int) -> Log:
         """Rows `first` to `end` - 1."""
