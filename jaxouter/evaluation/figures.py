@@ -16,12 +16,14 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.loop.trust import COHERENT, Report
 from jaxouter.plants import Plant
 
 matplotlib.use("agg")
 
 INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"
 UNITS = {"degC": "°C"}
+HELD_OUT_ROWS = 600  # that are drawn
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -236,3 +238,78 @@ def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.nd
     below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
     above.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return save(figure, path)
+
+
+def log_report(path: Path, report: Report, title: str, y_unit: str = "1", time_unit: str = "s") -> Path:
+    """What a log tells: the held-out free run, the step responses, and the levels and frequencies of its r~.
+
+    Args:
+        path: PNG.
+        report: of the log.
+        title: of the whole, such as the name of the log.
+        y_unit, time_unit: of the log.
+    """
+    figure = Figure(figsize=(10, 7.2), layout="constrained")
+    grid = figure.add_gridspec(2, 3)
+    unit = "" if y_unit in ("", "1") else f" [{symbol(y_unit)}]"
+    _held_out(figure.add_subplot(grid[0, :]), report, unit, time_unit)
+    _step_responses(figure.add_subplot(grid[1, 0]), report, time_unit)
+    _levels(figure.add_subplot(grid[1, 1]), report, unit)
+    _frequencies(figure.add_subplot(grid[1, 2]), report, time_unit)
+    figure.suptitle(title, fontsize=11)
+    return save(figure, path)
+
+
+def _held_out(axes: Axes, report: Report, unit: str, time_unit: str) -> None:
+    """Y of the last quarter, and what the models of the rest make of it."""
+    curves = report.curves
+    shown = slice(min(len(curves.time), HELD_OUT_ROWS))
+    t = curves.time[shown]
+    axes.fill_between(t, *curves.band[:, shown], color=LEARNED, alpha=0.2, lw=0, label="90 % of the ensemble")
+    axes.plot(t, curves.y[shown], color=REFERENCE, lw=1.0, label="y, recorded")
+    axes.plot(t, curves.free_run[shown], color=LEARNED, lw=1.4, label="nominal model, free run")
+    axes.set_ylabel(f"y{unit}")
+    axes.set_xlabel(f"time [{time_unit}]")
+    axes.set_xlim(t[0], t[-1])
+    told = f"{max(report.fit_free_run, 0.0):.1%} of the variance, {report.coverage:.0%} in the band"
+    axes.set_title(f"rows not fitted: {told}", fontsize=10, loc="left")
+    axes.legend(fontsize=7.5, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
+
+
+def _step_responses(axes: Axes, report: Report, time_unit: str) -> None:
+    nominal, *members = report.curves.responses
+    t = report.control_step * np.arange(len(nominal))
+    for i, member in enumerate(members):
+        axes.plot(t, member, color=LEARNED, lw=0.8, alpha=0.35, label=None if i else "members")
+    axes.plot(t, nominal, color=REFERENCE, lw=1.4, label="nominal")
+    axes.axvline(report.settling_time, color=INNER, ls=":", lw=1.2, label=f"settled {report.settling_time:.3g}")
+    axes.set_title(f"y after r̃ steps by 1: gain {report.gain:.3g}", fontsize=10, loc="left")
+    axes.set_xlabel(f"time [{time_unit}]")
+    axes.set_xlim(0, t[-1])
+    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
+
+
+def _levels(axes: Axes, report: Report, unit: str) -> None:
+    edges, levels = report.curves.edges, report.curves.levels
+    axes.bar(edges[:-1], 100.0 * levels, np.diff(edges), align="edge", color=MODIFIED, alpha=0.75)
+    for i, (low, high) in enumerate(report.levels_unseen):
+        axes.axvspan(low, high, color=LIMIT, alpha=0.12, lw=0, label=None if i else "never seen")
+    axes.set_xlim(edges[0], edges[-1])
+    axes.set_xlabel(f"r̃{unit}")
+    axes.set_ylabel("share of the time [%]")
+    axes.set_title(f"levels of r̃: {report.levels_seen:.0%} seen, {report.moves} moves", fontsize=10, loc="left")
+    if report.levels_unseen:
+        axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
+
+
+def _frequencies(axes: Axes, report: Report, time_unit: str) -> None:
+    curves = report.curves
+    axes.axvspan(curves.frequency[0], report.needed, color=LEARNED, alpha=0.1, lw=0, label="needed")
+    axes.plot(curves.frequency, curves.coherence, color=LEARNED, lw=1.4, label="coherence of r̃ and y")
+    axes.plot(curves.frequency, curves.power / curves.power.max(), color=MODIFIED, lw=1.0, label="power of r̃, relative")
+    axes.axhline(COHERENT, color=INNER, ls=":", lw=1.2)
+    log_axis(axes, "x")
+    axes.set_ylim(0, 1.05)
+    axes.set_xlabel(f"frequency [1/{time_unit}]")
+    axes.set_title(f"{report.excited_share:.0%} of the needed frequencies shown", fontsize=10, loc="left")
+    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")

@@ -79,6 +79,8 @@ class Plant:
     """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
     draw: Callable[[chex.PRNGKey, Any], Any] | None = None
     """`draw(key, params) -> params`: parameters of a training episode (domain randomisation); None: the given ones."""
+    identified: bool = False
+    """Its equations are a model of a record, and not the plant's own: a learner may know them, as they cost nothing."""
     reuse: Callable[[Any, Any], Any] = lambda old, fresh: fresh
     """`reuse(old, fresh) -> state`: the fresh state, with what of the old one need not be cleared at a reset (the
     contents of delay lines), so that it isn't copied."""

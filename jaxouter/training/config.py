@@ -186,8 +186,10 @@ class TrainConfig:
 
     @property
     def identification_steps(self) -> int:
-        """Control steps recorded before the training, of each seed."""
+        """Control steps recorded before the training, of each seed; none of a plant that is made from a record."""
         plant, start = plants.make(self.plant)[0], self.pretraining
+        if plant.identified:
+            return 0
         recorded = start.episodes * (start.episode_steps or plant.episode_steps) if start.gradient_steps else 0
         return recorded + (LEVELS * plant.episode_steps if self.residual else 0)
 

@@ -197,6 +197,8 @@ def pretrain(
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
+    One that is already made of models from a record is not identified once more.
+
     Args:
         config: how many of both.
         plant, plant_params: only recorded from, through r~ and y.
@@ -206,6 +208,8 @@ def pretrain(
         begin: where a rehearsal with the same arguments was stopped; None: at its beginning.
     """
     key_record, *keys = jax.random.split(key, 3)
+    if plant.identified:
+        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin)
     lags = config.lags or policy.observer.history
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
