@@ -15,7 +15,7 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures
-from jaxouter.loop import identify
+from jaxouter.loop import identify, log, trust
 from jaxouter.plants import Plant, contract, simulate
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.plants.sources import add
@@ -29,14 +29,15 @@ class Options:
     """Test whether a plant of your own keeps the contract, and show how it responds to r~.
 
     Exit status 1 where it does not. The picture shows y after r~ has moved up or down from the middle of its range.
+    Of a log it is told, and shown, how far its models can be trusted.
     """
 
     plant: Annotated[str, tyro.conf.Positional]
-    """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, pitch or heaters."""
-    figure: Path = Path("step-response.png")
-    """File for the picture."""
+    """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, log:FILE, pitch or heaters."""
+    figure: Path | None = None
+    """File for the picture; default: step-response.png, or log.png for a log."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
-    """What a plant gym:ID or fmu:FILE does not say itself."""
+    """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -45,12 +46,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options = tyro.cli(Options, prog="python -m jaxouter.check", args=arguments)
         plant, params = plants.make(add(options.plant, options.plant_options))
         cli.use_compilation_cache()
-        if not options.figure.resolve().parent.is_dir():
-            raise ValueError(f"--figure is {options.figure}; its folder does not exist")
+        figure = options.figure or Path("log.png" if plant.identified else "step-response.png")
+        if not figure.resolve().parent.is_dir():
+            raise ValueError(f"--figure is {figure}; its folder does not exist")
         found = [("shapes and types", None), *contract.behaviour(plant, params)]
         cli.table(f"{plant.name}: the contract", ["what", "is"], [[what, wrong or "kept"] for what, wrong in found])
-        gain, offset = identify.dc_gain(plant, params, jax.random.key(0))
-        moves, responses = step_responses(plant, params)
+        if plant.identified:
+            picture = log_report(plant, options.plant.partition(":")[2], figure)
+        else:
+            picture = response_report(plant, params, figure)
+    print(f"figure: {picture}")
+    if any(wrong for _, wrong in found):
+        raise SystemExit(1)
+
+
+def log_report(plant: Plant, path: str, figure: Path) -> Path:
+    """How far the log of this plant can be trusted, told and drawn."""
+    told = trust.report(*log.identified(path))
+    rows = [list(row) for row in trust.table(told, plant.y_unit, plant.time_unit)]
+    cli.table(f"{plant.name}: how far the log can be trusted", ["what", "is"], rows)
+    for warning in told.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    return figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
+
+
+def response_report(plant: Plant, params: object, figure: Path) -> Path:
+    """How the plant responds to r~, told and drawn."""
+    gain, offset = identify.dc_gain(plant, params, jax.random.key(0))
+    moves, responses = step_responses(plant, params)
     reached = sorted(float(offset + gain * end) for end in plant.r_tilde_bounds)
     lines = [
         ("DC gain", f"{float(gain):.3g}, y = {float(offset):.3g} {plant.y_unit} at r~ = 0"),
@@ -61,9 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cli.table(f"{plant.name}: how it responds", ["what", "is"], [list(line) for line in lines])
     if reached[0] > plant.setpoint_range[0] or reached[1] < plant.setpoint_range[1]:
         print("warning: no r~ within its bounds holds y at every set-point", file=sys.stderr)
-    print(f"figure: {figures.step_responses(options.figure, plant, moves, responses)}")
-    if any(wrong for _, wrong in found):
-        raise SystemExit(1)
+    return figures.step_responses(figure, plant, moves, responses)
 
 
 def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray]:

@@ -36,7 +36,7 @@ class Options:
     """
 
     plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
-    """pitch, heaters or your own: FILE.py:NAME, gym:ID, fmu:FILE; default: that of the runs, or pitch."""
+    """pitch, heaters or your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; default: that of the runs, or pitch."""
     run: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")] = ()
     """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()

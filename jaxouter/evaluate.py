@@ -39,7 +39,7 @@ class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder, or the folder of one seed in it."""
     plant: str | None = None
-    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE; without a run, that of the policy."""
+    """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; without a run, that of the policy."""
     policy: str | None = None
     """A rival instead, such as none (r~ = r) or static (inverse of the DC gain); identified first, once."""
     scenario: tuple[str, ...] = ()

@@ -120,6 +120,7 @@ LAG = Plant(
     episode_steps=50,
     r_tilde_bounds=(-4.0, 4.0),
     setpoint_range=(-1.0, 1.0),
+    move_threshold=math.inf,
     evaluation_range=(-1.0, 1.0),
     divergence_bounds=(-20.0, 20.0),
     history=5,

@@ -7,7 +7,7 @@ import pytest
 
 from jaxouter import check, plants
 from jaxouter.plants import sources
-from tests import lag
+from tests import lag, logs
 from tests.load import ROOT
 
 TANKS = ROOT / "scripts" / "examples" / "tanks.py"
@@ -44,6 +44,16 @@ def test_what_is_not_pure_is_found_and_ends_with_status_1(tmp_path, capsys):
         check.main([f"{tmp_path}/own.py:Tanks", "--figure", str(tmp_path / "steps.png")])
     assert end.value.code in (1, 2)
     assert "control steps" in capsys.readouterr().out
+
+
+def test_a_log_is_told_how_far_it_can_be_trusted(tmp_path, capsys):
+    path = logs.write(tmp_path / "tank-3.csv", logs.recorded(*lag.make(), rows=800, noise=0.03))
+    figure = tmp_path / "log.png"
+    check.main([f"log:{path}", "--figure", str(figure)])
+    out = capsys.readouterr().out
+    assert "tank-3: how far the log can be trusted" in out
+    assert "held out, free run" in out
+    assert figure.read_bytes().startswith(b"\x89PNG")
 
 
 def test_mistakes_are_said(capsys):

@@ -15,6 +15,7 @@ from scipy.signal import lfilter, lfiltic
 from jaxouter.loop.identify import Record, fit_arx
 from jaxouter.plants import Plant, arx
 from jaxouter.plants.arx import Model
+from jaxouter.plants.simulators import PlantOptions
 
 COLUMNS = ("time", "r_tilde", "y")
 LEAST_ROWS = 200
@@ -336,47 +337,39 @@ def set_points(log: Log, models: Ensemble, r_tilde_bounds: tuple[float, float]) 
     return low, high
 
 
-def make(
-    path: str,
-    *,
-    members: int = 16,
-    seed: int = 0,
-    r_tilde_bounds: tuple[float, float] | None = None,
-    setpoint_range: tuple[float, float] | None = None,
-    episode_steps: int | None = None,
-    y_unit: str = "1",
-) -> tuple[Plant, arx.ARXParams]:
+def make(name: str, path: str, options: PlantOptions = PlantOptions()) -> tuple[Plant, arx.ARXParams]:  # noqa: B008
     """The plant of a log, and its parameters: undrawn the model of all rows, drawn a member of the ensemble.
 
+    r~ stays within what the log has seen, set-points within what nine of ten members hold by it; an episode is four
+    settling times long, within 100 to 400 control steps; unless the options say otherwise.
+
     Args:
+        name: of the plant.
         path: CSV or Parquet file, see `read`; time in s.
-        members, seed: of the ensemble.
-        r_tilde_bounds: None: the least and the greatest r~ in the log.
-        setpoint_range: None: what these r~ hold, as far as it has been seen.
-        episode_steps: None: four settling times, within 100 to 400 control steps.
-        y_unit: for figures and tables.
+        options: what is known beside the log.
 
     Raises:
         ValueError: the log is not what it must be, or does not tell enough.
     """
-    log, models = identified(path, members, seed)
-    low, high = float(log.r_tilde.min()), float(log.r_tilde.max())
-    bounds = (low, high) if r_tilde_bounds is None else r_tilde_bounds
-    setpoint_range = set_points(log, models, bounds) if setpoint_range is None else setpoint_range
-    steps = min(max(4 * settling(models.nominal), 100), 400) if episode_steps is None else episode_steps
+    if (options.control_step, options.input, options.output) != (None, None, None):
+        raise ValueError("a log tells its control step, and has one r~ and one y; --control-step, --input, --output go")
+    log, models = identified(path)
+    bounds = options.r_tilde_bounds or (float(log.r_tilde.min()), float(log.r_tilde.max()))
+    declared = options.declared(
+        r_tilde_bounds=bounds,
+        setpoint_range=options.setpoint_range or set_points(log, models, bounds),
+        control_step=log.step,
+        episode_steps=min(max(4 * settling(models.nominal), 100), 400),
+        y_unit="1",
+    )
     span = float(np.ptp(log.y))
     return arx.make(
         models.nominal,
         models.members,
-        name=f"log:{path}",
-        y_unit=y_unit,
+        name=name,
         time_unit="s",
-        control_step=log.step,
-        episode_steps=steps,
-        r_tilde_bounds=bounds,
-        setpoint_range=setpoint_range,
-        evaluation_range=setpoint_range,
         divergence_bounds=(float(log.y.min()) - 2.0 * span, float(log.y.max()) + 2.0 * span),
         history=min(max(len(models.nominal.b), 5), 20),
-        family_steps=3 * steps,
+        family_steps=3 * declared["episode_steps"],
+        **declared,
     )

@@ -81,6 +81,8 @@ def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
     Raises:
         ValueError: a name is not one of the plant's numbers (lists those), or a range is none.
     """
+    if plant.identified:
+        raise ValueError(f"plant {plant.name!r} has nothing to draw by a range; its models are drawn, see log:FILE")
     named = {name: (low, high) for name, low, high in ranges}
     known = numbers(params)
     for name, (low, high) in named.items():

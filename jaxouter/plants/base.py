@@ -29,6 +29,9 @@ def _is_float(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
+MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
+
+
 @dataclass(frozen=True)
 class Plant:
     """A plant with its inner loop, seen from outside: r~ goes in, y comes out.
@@ -63,7 +66,8 @@ class Plant:
     rate_limit: float | None = None
     """|y_(k+1) - y_k| must not exceed this (the paper's L on heaters)."""
     move_threshold: float | None = None
-    """Moves of r~ and of y of at least this size are charged (the paper's rho_h and rho_b)."""
+    """Moves of r~ and of y of at least this size are charged (the paper's rho_h and rho_b); default: 3 % of the range
+    of r~, inf: none. Where moves cost nothing, an r~ that goes to and fro between its bounds may be what is learned."""
     history: int = 15
     """Default number of past samples of y and r~ in the observation."""
     families: tuple[str, ...] = ("steps", "staircase", "ramps")
@@ -103,6 +107,8 @@ class Plant:
     def __post_init__(self) -> None:
         low, high = self.r_tilde_bounds
         beyond = 2 * (high - low)
+        if self.move_threshold is None:
+            object.__setattr__(self, "move_threshold", MOVE * (high - low))
         object.__setattr__(self, "evaluation_range", self.evaluation_range or self.setpoint_range)
         object.__setattr__(self, "divergence_bounds", self.divergence_bounds or (low - beyond, high + beyond))
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):

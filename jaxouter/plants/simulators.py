@@ -189,7 +189,7 @@ class _Fmu:
         return float((self._fmu.getFloat64 if self._three else self._fmu.getReal)(self._output)[0])
 
 
-def from_fmu(name: str, path: Path, options: PlantOptions) -> tuple[Plant, tuple[()]]:
+def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[()]]:
     """The plant in an FMU for co-simulation (FMI 2 or 3), from one of its inputs to one of its outputs.
 
     Raises:
@@ -200,8 +200,8 @@ def from_fmu(name: str, path: Path, options: PlantOptions) -> tuple[Plant, tuple
     except ImportError:
         raise ValueError('a plant fmu:FILE needs FMPy: pip install "jaxouter[fmu]"') from None
     try:
-        description = fmpy.read_model_description(str(path))
-        folder = str(fmpy.extract(str(path)))
+        description = fmpy.read_model_description(path)
+        folder = str(fmpy.extract(path))
     except Exception as error:  # whatever a file that is none makes FMPy raise
         raise ValueError(f"{path} is not a readable FMU: {str(error).partition(chr(10))[0]}") from None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)

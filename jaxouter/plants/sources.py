@@ -2,7 +2,7 @@
 
 `FILE.py:NAME` is a plant of one's own, in a file: a function that returns the plant and its parameters, as
 `jaxouter.plants.pitch.make` does. An installed package may offer one as an entry point of the group `jaxouter.plants`.
-`gym:ID` and `fmu:FILE` are simulated elsewhere.
+`gym:ID` and `fmu:FILE` are simulated elsewhere; `log:FILE` is what a record of r~ and y tells of a plant.
 
 A plant is imported only because a command line names it, never because a run folder does. It is then known by a short
 name, in scenarios (`Tank/steps`) and in folders (`runs/Tank-default-0`).
@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import inspect
+import pkgutil
 import re
 import sys
 from collections.abc import Callable
@@ -28,7 +29,12 @@ from jaxouter.plants.base import Plant
 from jaxouter.plants.simulators import PlantOptions
 
 GROUP = "jaxouter.plants"  # of entry points
-FORMS = "FILE.py:NAME, gym:ID, fmu:FILE"
+KINDS = {
+    "gym": "jaxouter.plants.simulators:from_gymnasium",
+    "fmu": "jaxouter.plants.simulators:from_fmu",
+    "log": "jaxouter.loop.log:make",  # by name, for identification stands on the plants
+}
+FORMS = "FILE.py:NAME, gym:ID, fmu:FILE, log:FILE"
 
 
 class Source(NamedTuple):
@@ -94,14 +100,12 @@ def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa:
 def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tuple[Plant, Any]], Path]:
     """Short name, maker and file of a plant."""
     kind, _, rest = reference.partition(":")
-    if kind == "gym":
-        name = _short(re.split("[/:]", rest)[-1])
-        return name, cache(lambda: simulators.from_gymnasium(name, rest, options)), simulators.file_of(rest)
-    if kind == "fmu":
-        name, path = _short(Path(rest).stem), Path(rest)
+    if kind in KINDS:
+        make, path = pkgutil.resolve_name(KINDS[kind]), simulators.file_of(rest) if kind == "gym" else Path(rest)
         if not path.is_file():
             raise ValueError(f"{reference}: there is no file {rest}")
-        return name, cache(lambda: simulators.from_fmu(name, path, options)), path
+        name = _short(re.split("[/:]", rest)[-1] if kind == "gym" else path.stem)
+        return name, cache(lambda: make(name, rest, options)), path
     _plain(reference, options)
     file, colon, name = reference.rpartition(":")
     if colon and file.endswith(".py"):
@@ -116,7 +120,9 @@ def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tup
 
 def _plain(reference: str, options: PlantOptions) -> None:
     if options != PlantOptions():
-        raise ValueError(f"{reference} declares itself; options such as --y-index and --input are for gym: and fmu:")
+        raise ValueError(
+            f"{reference} declares itself; options such as --y-index and --input are for gym:, fmu: and log:"
+        )
 
 
 def _short(text: str) -> str:

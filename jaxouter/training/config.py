@@ -59,7 +59,7 @@ class TrainConfig:
     """One training run. Every field is an option of `python -m jaxouter.train`."""
 
     plant: Annotated[str, tyro.conf.Positional]
-    """Plant to learn on: pitch, heaters, FILE.py:NAME (a plant of your own), gym:ID or fmu:FILE."""
+    """Plant to learn on: pitch, heaters, FILE.py:NAME (your own), gym:ID, fmu:FILE or log:FILE."""
     preset: str
     """The preset that gave the defaults."""
     seed: int = 0
@@ -100,7 +100,7 @@ class TrainConfig:
     noise_end: float = 1.0
     """Factor on the volatility at the end of training, reached linearly."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
-    """What a plant gym:ID or fmu:FILE does not say itself."""
+    """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
     """The start."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)

@@ -17,6 +17,7 @@ from jaxouter import plants
 from jaxouter.loop import environment
 from jaxouter.loop import log as logs
 from jaxouter.loop.log import Log
+from jaxouter.plants.simulators import PlantOptions
 from tests import lag
 from tests.logs import recorded, write
 
@@ -175,11 +176,11 @@ def test_an_output_that_has_nothing_to_do_with_r_tilde_is_refused(tmp_path: Path
     noise = clean._replace(y=np.random.default_rng(0).standard_normal(600))
     file = write(tmp_path / "noise.csv", noise)
     with pytest.raises(ValueError, match="do not agree on any y"):
-        logs.make(str(file))
+        logs.make("log", str(file))
 
 
 def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: Log) -> None:
-    plant, params = logs.make(str(path))
+    plant, params = logs.make("log", str(path))
     low, high = plant.r_tilde_bounds
     assert (low, high) == (noisy.r_tilde.min(), noisy.r_tilde.max())
     np.testing.assert_allclose(plant.setpoint_range, (0.5 * low, 0.5 * high), atol=0.1)
@@ -196,36 +197,41 @@ def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: Log) -> Non
 
 def test_what_it_declares_can_be_overridden(path: Path) -> None:
     changes = dict(r_tilde_bounds=(-3.0, 3.0), setpoint_range=(-1.0, 0.5), episode_steps=77, y_unit="degC")
-    plant, params = logs.make(str(path), members=3, **changes)
+    plant, _ = logs.make("log", str(path), PlantOptions(**changes))
     assert {name: getattr(plant, name) for name in changes} == changes
     assert plant.evaluation_range == (-1.0, 0.5)
-    assert params.ensemble.c.shape == (3,)
-    narrower, _ = logs.make(str(path), r_tilde_bounds=(-1.0, 1.0))
+    narrower, _ = logs.make("log", str(path), PlantOptions(r_tilde_bounds=(-1.0, 1.0)))
     np.testing.assert_allclose(narrower.setpoint_range, (-0.5, 0.5), atol=0.02)
+    with pytest.raises(ValueError, match="a log tells its control step"):
+        logs.make("log", str(path), PlantOptions(control_step=1.0))
 
 
 def test_an_environment_draws_a_member_for_each_episode(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: logs.make(str(path)))
+    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: logs.make("log", str(path)))
     env, params = environment.make("logged")
     _, state = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, 40), params)
     found = np.asarray(state.plant_params.model.c)
     assert len(np.unique(found)) > 8
     assert set(found.tolist()) <= set(np.asarray(params.plant.ensemble.c).tolist())
+    with pytest.raises(ValueError, match="nothing to draw by a range"):
+        environment.make("logged", drawn=(("c", 0.0, 1.0),))
 
 
 def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: Log) -> None:
     file = write(tmp_path / "lag.csv", clean)
-    (first, params), (second, _) = logs.make(str(file)), logs.make(str(file))
+    (first, params), (second, _) = logs.make("log", str(file)), logs.make("log", str(file))
     assert hash(first) == hash(second)
     assert first == second
     assert logs.identified(file)[1] is logs.identified(file)[1]
     write(file, clean._replace(y=2.0 * clean.y))
-    assert float(logs.make(str(file))[1].model.b.sum()) == pytest.approx(2.0 * float(params.model.b.sum()), rel=1e-3)
+    assert float(logs.make("log", str(file))[1].model.b.sum()) == pytest.approx(
+        2.0 * float(params.model.b.sum()), rel=1e-3
+    )
 
 
 def test_an_error_of_identification_names_the_file(tmp_path: Path) -> None:
     t = 0.1 * np.arange(300)
     file = write(tmp_path / "away.csv", Log(t, np.sin(t), np.exp(0.05 * np.arange(300))))
     with pytest.raises(ValueError, match=r"away\.csv: every model of this log is unstable"):
-        logs.make(str(file))
+        logs.make("log", str(file))
     assert math.isfinite(logs.read(file).step)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import chex
 import jax
@@ -103,7 +104,7 @@ def test_parts_add_up() -> None:
 
 
 def test_plant_without_thresholds_and_limits_pays_for_the_error_only() -> None:
-    plant = dataclasses.replace(PITCH, output_limit=None, rate_limit=None, move_threshold=None)
+    plant = dataclasses.replace(PITCH, output_limit=None, rate_limit=None, move_threshold=math.inf)
     assert reward(plant, r=2.0, y=1e3, y_before=-1e3, r_tilde=50.0) == pytest.approx(-0.3 * 998)
 
 

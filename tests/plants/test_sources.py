@@ -11,7 +11,9 @@ from jaxouter import evaluate, plants, train
 from jaxouter.plants import contract, host, simulate, sources
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.run import Run
+from tests import lag
 from tests.load import ROOT
+from tests.logs import recorded, write
 
 TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
 TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]
@@ -43,6 +45,17 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
     del plants.REGISTRY["Tanks"], sources.SOURCES["Tanks"]
     with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
         Run.open(tmp_path / "run")
+
+
+def test_a_log_is_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "lag.csv", recorded(*lag.make(), rows=600, noise=0.03))
+    train.main(["log:lag.csv", "--y-unit", "cm", "--out", "run", *TINY])
+    assert "MAE in cm" in capsys.readouterr().out
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["config"]["plant"] == "lag"
+    with pytest.raises(SystemExit):
+        train.main(["log:none.csv"])
+    assert "there is no file none.csv" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
