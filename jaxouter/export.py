@@ -15,7 +15,7 @@ from jaxouter import cli
 from jaxouter.deploy import c, fmu, verify
 from jaxouter.deploy.law import Law
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.run import open_run
+from jaxouter.training.run import add_plant, open_run
 
 FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
 
@@ -31,6 +31,8 @@ class Options:
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder (its median seed is exported), or the folder of one seed in it."""
+    plant: str | None = None
+    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE; its options are those of the run."""
     format: str | None = None
     """onnx, npz, stablehlo, c or fmu."""
     out: Path | None = None
@@ -80,7 +82,10 @@ def check(options: Options) -> tuple[Path, str, Path]:
         asked = "say --format" if kind is None else f"there is no format {kind!r}"
         raise ValueError(f"{asked}; the formats are: {', '.join(FORMATS)}")
     out = run / f"controller.{kind}" if options.out is None else options.out
-    open_run(run)
+    named = None if options.plant is None else add_plant(options.plant, run)
+    made_on = open_run(run)[0].config.plant
+    if named not in (None, made_on):
+        raise ValueError(f"{run} is a run on {made_on}, not on {named}")
     if out.suffix != f".{kind}":
         raise ValueError(f"--out is {out}; for the format {kind} its name must end in .{kind}")
     for path in written(kind, out):

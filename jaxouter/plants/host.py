@@ -100,24 +100,26 @@ def plant(make: Callable[[], Simulator], **declared: Any) -> tuple[Plant, tuple[
     float_ = jnp.result_type(float)
     result = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), float_)
 
-    def begin(seed: Any) -> tuple[np.ndarray, np.ndarray]:
-        return _arrays(*moments.begin(int(seed)))
+    def begin(seeds: Any) -> tuple[np.ndarray, np.ndarray]:
+        return _arrays([moments.begin(seed) for seed in np.ravel(seeds).tolist()], np.shape(seeds))
 
-    def advance(moment: Any, r_tilde: Any) -> tuple[np.ndarray, np.ndarray]:
-        return _arrays(*moments.step(int(moment), float(r_tilde)))
+    def advance(at: Any, r_tilde: Any) -> tuple[np.ndarray, np.ndarray]:
+        lanes = zip(np.ravel(at).tolist(), np.ravel(r_tilde).tolist(), strict=True)
+        return _arrays([moments.step(*lane) for lane in lanes], np.shape(at))
 
-    def _arrays(moment: int, y: float) -> tuple[np.ndarray, np.ndarray]:
-        return np.asarray(moment, np.int32), np.asarray(y, float_)
+    def _arrays(lanes: list[tuple[int, float]], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        moment, y = zip(*lanes, strict=True)
+        return np.asarray(moment, np.int32).reshape(shape), np.asarray(y, float_).reshape(shape)
 
     def init(key: chex.PRNGKey, params: Any) -> HostState:
         del params
         return HostState(
-            *jax.pure_callback(begin, result, jax.random.bits(key, (), jnp.uint32), vmap_method="sequential")
+            *jax.pure_callback(begin, result, jax.random.bits(key, (), jnp.uint32), vmap_method="broadcast_all")
         )
 
     def step(params: Any, state: HostState, r_tilde: jax.Array, key: chex.PRNGKey) -> HostState:
         del params, key
-        return HostState(*jax.pure_callback(advance, result, state.moment, r_tilde, vmap_method="sequential"))
+        return HostState(*jax.pure_callback(advance, result, state.moment, r_tilde, vmap_method="broadcast_all"))
 
     def output(params: Any, state: HostState) -> jax.Array:
         del params

@@ -179,14 +179,21 @@ class _Fmu:
 
         try:
             (self._fmu.setFloat64 if self._three else self._fmu.setReal)(self._input, [r_tilde])
-            self._fmu.doStep(self._time, self._control_step)
+            done = self._fmu.doStep(self._time, self._control_step)
         except FMICallException:
             return math.nan
         self._time += self._control_step
-        return self._y()
+        wants_to_end = self._three and done[1]
+        return math.nan if wants_to_end else self._y()
 
     def _y(self) -> float:
         return float((self._fmu.getFloat64 if self._three else self._fmu.getReal)(self._output)[0])
+
+
+def _said(variable: Any, attribute: str) -> str | None:
+    """An attribute of an FMU's variable, which may stand in its declared type."""
+    own = getattr(variable, attribute)
+    return getattr(variable.declaredType, attribute, None) if own is None else own
 
 
 def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[()]]:
@@ -212,22 +219,30 @@ def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[
         known = {
             variable.name: variable
             for variable in description.modelVariables
-            if variable.causality == causality and variable.type in ("Real", "Float64")
+            if variable.causality == causality and variable.type in ("Real", "Float64") and not variable.dimensions
         }
         asked = getattr(options, causality)
         if asked not in known and (asked is not None or len(known) != 1):
             raise ValueError(f"--{causality} is {asked}; {path} has: {', '.join(known) or 'none'}")
         variables[causality] = known[asked or next(iter(known))]
-    low, high = (float(getattr(variables["input"], end) or math.nan) for end in ("min", "max"))
+    low, high = (float(_said(variables["input"], end) or math.nan) for end in ("min", "max"))
     experiment = description.defaultExperiment
     step_size = None if experiment is None or experiment.stepSize is None else float(experiment.stepSize)
-    unit = getattr(variables["output"], "unit", None) or "1"
+    unit = _said(variables["output"], "unit") or "1"
     declared = options.declared(
         r_tilde_bounds=(low, high), control_step=step_size or 1.0, episode_steps=EPISODE, y_unit=unit
     )
     names = variables["input"].name, variables["output"].name
 
-    def simulator() -> _Fmu:
+    def make() -> _Fmu:
         return _Fmu(description, folder, *names, declared["control_step"])
+
+    try:
+        free = [make()]
+    except Exception as error:  # whatever FMPy raises, as where there is no binary for this system
+        raise ValueError(f"{path} can't be started here: {error}") from None
+
+    def simulator() -> _Fmu:
+        return free.pop() if free else make()
 
     return host.plant(simulator, name=name, time_unit="s", **declared)

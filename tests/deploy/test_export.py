@@ -11,6 +11,7 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import fmpy
 import jax
@@ -26,9 +27,12 @@ from fmpy.validation import validate_fmu
 from jaxouter import export, plants
 from jaxouter.deploy import c, fmu, verify
 from jaxouter.deploy.law import Law
+from jaxouter.plants import sources
 from jaxouter.training.run import Run
+from tests.load import ROOT
 from tests.training.small import small
 
+TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
 STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 MORE = ["-Wshadow", "-Wconversion", "-Wno-sign-conversion", "-Wdouble-promotion", "-Wundef"]
 
@@ -173,6 +177,21 @@ def test_command_writes_beside_the_run(pitch):
     path.unlink()
 
 
+def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
+    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+        run = trained(sources.add(TANKS), tmp_path).run
+    arguments = [sys.executable, "-m", "jaxouter.export", str(run.path), "--format", "c"]
+    unnamed = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
+    assert (unnamed.returncode, unnamed.stdout) == (2, "")
+    assert "so name this plant on the command line" in unnamed.stderr
+    done = subprocess.run([*arguments, "--plant", TANKS], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, "")
+    told, *_, found = done.stdout.splitlines()
+    assert told.startswith("Tanks, seed 0: r~ in [2, 30] cm from r and y in cm, once every 10 s; ")
+    assert found.startswith("verified: ")
+    assert "Tanks_outer_loop_step" in (run.path / "controller.h").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -181,6 +200,8 @@ def test_command_writes_beside_the_run(pitch):
         (["pitch", "--format", "pt"], "there is no format 'pt'; the formats are: onnx, npz, stablehlo, c, fmu"),
         (["nowhere", "--format", "c"], "nowhere is not a run folder"),
         (["pitch/seed-7", "--format", "c"], "pitch/seed-7 is not a seed of its run, which has: 0"),
+        (["pitch", "--format", "c", "--plant", "heaters"], "pitch is a run on pitch, not on heaters"),
+        (["pitch", "--format", "c", "--plant", "no"], "there is no plant 'no'; the plants are: pitch, heaters"),
         (["empty", "--format", "npz"], "empty/seed-0 has no checkpoint yet"),
         (["pitch", "--format", "c", "--out", "a.cpp"], "--out is a.cpp; for the format c its name must end in .c"),
         (["pitch", "--format", "c", "--out", "there.c"], "there.h exists; remove it, or choose another --out"),

@@ -1,0 +1,120 @@
+"""FMUs as plants, FMI 2 and 3, from the file to a trained outer loop."""
+
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+from unittest.mock import patch
+
+import jax
+import numpy as np
+import pytest
+from fmpy import platform_tuple, sharedLibraryExtension
+from fmpy.validation import validate_fmu
+
+from jaxouter import check, export, plants, train
+from jaxouter.deploy import c
+from jaxouter.plants import contract, simulate, sources
+from jaxouter.plants.simulators import PlantOptions
+from jaxouter.training.run import Run
+from tests.training.small import small
+
+TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]
+FEW = ["--episode-steps", "30"]
+K, T, D = 0.5, 0.3, 0.25  # of lag_fmi3.c
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+        yield
+
+
+@pytest.fixture(scope="module")
+def controller(tmp_path_factory):
+    """FMI 2: what our own exporter makes, from r to r~."""
+    if not any(map(shutil.which, c.COMPILERS)):
+        pytest.skip("there is no C compiler")
+    folder = tmp_path_factory.mktemp("exported")
+    run = Run.create(small("pitch", residual=True), folder / "run")
+    trainer, params = run.trainer
+    run.save(0, 1, trainer.start(0, params))
+    export.main([str(run.path), "--format", "fmu", "--out", str(folder / "outer.fmu")])
+    return folder / "outer.fmu"
+
+
+@pytest.fixture(scope="module")
+def lag(tmp_path_factory):
+    """FMI 3: a first-order lag with a dead time."""
+    if shutil.which("gcc") is None:
+        pytest.skip("gcc is not installed")
+    folder, here = tmp_path_factory.mktemp("compiled"), Path(__file__).parent
+    library = folder / f"lag{sharedLibraryExtension}"
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, str(here / "lag_fmi3.c"), "-o", str(library), "-lm"], check=True, timeout=60)
+    with zipfile.ZipFile(folder / "lag.fmu", "w") as file:
+        file.write(here / "lag_fmi3.xml", "modelDescription.xml")
+        file.write(library, f"binaries/{platform_tuple}/{library.name}")
+    assert validate_fmu(str(folder / "lag.fmu")) == []
+    return folder / "lag.fmu"
+
+
+def trained(arguments, name, capsys):
+    """The run that `train` makes of a plant, and what it says."""
+    train.main([*arguments, "--out", "run", *TINY])
+    out = capsys.readouterr().out
+    assert f"{name}/steps" in out
+    assert "diverged" not in out
+    return Run.open(Path("run")).config
+
+
+def test_an_exported_controller_is_a_plant(controller, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    options = ["--input", "r", "--output", "r_tilde", "--r-tilde-bounds", "-10", "10", *FEW]
+    check.main([f"fmu:{controller}", *options])
+    out = capsys.readouterr().out
+    assert out.count("kept") == 5
+    assert "-5 to 5 crad" in out
+    config = trained([f"fmu:{controller}", *options], "outer", capsys)
+    assert (config.plant, config.plant_options.input, config.plant_options.r_tilde_bounds) == ("outer", "r", (-10, 10))
+    export.main(["run", "--plant", f"fmu:{controller}", "--format", "npz"])
+    assert "r~ in [-10, 10] crad" in capsys.readouterr().out
+
+
+def test_what_an_fmu_leaves_open_must_be_said(controller):
+    with pytest.raises(ValueError, match=r"--input is None; .*outer.fmu has: r, y"):
+        sources.add(f"fmu:{controller}")
+    with pytest.raises(ValueError, match=r"r~ lies between nan and nan: give it finite bounds"):
+        sources.add(f"fmu:{controller}", PlantOptions(input="r"))
+
+
+def test_an_fmu_for_another_system_is_refused(lag, tmp_path):
+    with zipfile.ZipFile(lag) as whole, zipfile.ZipFile(tmp_path / "lag.fmu", "w") as file:
+        file.writestr("modelDescription.xml", whole.read("modelDescription.xml"))
+    with pytest.raises(ValueError, match=r"lag.fmu can't be started here: Cannot find shared library"):
+        sources.add(f"fmu:{tmp_path}/lag.fmu")
+
+
+def response(r_tilde, times):
+    """Y of the lag from rest, of moves of r~ at the control steps."""
+    since = times[:, None] - 0.1 * np.arange(len(r_tilde)) - D
+    return K * (1.0 - np.exp(-np.maximum(since, 0.0) / T)) @ np.diff(r_tilde, prepend=0.0)
+
+
+def test_an_fmu_of_fmi_3_says_what_it_is_and_answers_as_its_equation_does(lag):
+    plant, params = plants.make(sources.add(f"fmu:{lag}"))
+    assert (plant.r_tilde_bounds, plant.control_step, plant.y_unit) == ((-4.0, 4.0), 0.1, "cm")
+    assert [what for what, wrong in contract.behaviour(plant, params) if wrong] == []
+    rng = np.random.default_rng(0)
+    for r_tilde in (np.ones(50), rng.uniform(-4.0, 4.0, 50), rng.uniform(-4.0, 4.0, 50)):
+        y = simulate(plant, params, r_tilde.astype(np.float32), jax.random.key(0))
+        np.testing.assert_allclose(y, response(r_tilde, 0.1 * np.arange(1, 51)), atol=1e-6)
+
+
+def test_an_fmu_of_fmi_3_is_trained_on_and_checked(lag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    check.main([f"fmu:{lag}", *FEW])
+    out = capsys.readouterr().out
+    assert out.count("kept") == 5
+    assert "2 control steps of 0.1 s" in out
+    assert trained([f"fmu:{lag}", *FEW], "lag", capsys).plant == "lag"
