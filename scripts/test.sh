@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
 # Lint, types and tests, those of plants and loop in double precision too; under 12 minutes on 2 cores. With --all, under
-# 80 minutes, also the slow tests, all others in double precision with checks for NaN, places broken on purpose, 20
-# kills, and stable-baselines3 on our environment (5 GB the first time, see peers.sh); what came out is in
-# benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
+# 90 minutes, also the slow tests, all others in double precision with checks for NaN, places broken on purpose, 20
+# kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time, see
+# peers.sh); what came out is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested
+# then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile "$@"; }
 in_double() { JAX_ENABLE_X64=1 tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
+documentation() { NO_MKDOCS_2_WARNING=1 "$PYTHON" -m mkdocs build --strict --quiet && "$PYTHON" scripts/docs.py; }
 part() {  # TITLE COMMAND...: run it, and note its last line and its minutes
     local title=$1 begin=$SECONDS last
     shift
@@ -31,6 +33,7 @@ elif [ "$*" = --all ]; then
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" "$PYTHON" scripts/mutants.py
     part "20 kills" "$PYTHON" scripts/soak.py
+    part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py
     exit $failed
 else

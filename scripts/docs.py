@@ -1,0 +1,154 @@
+"""Run the code blocks of the documentation as they stand, each page in a copy of this checkout of its own.
+
+    python scripts/docs.py                             # all pages of docs
+    python scripts/docs.py docs/tutorial.md            # one of them
+
+Blocks of `bash` and `python` are run in their order, in one process a page: the Python blocks share a namespace, a Bash
+block ends at the first command that fails. All others are only shown, and so is a block below a comment
+`<!-- not run: WHY -->`. Ends with status 1 if a page fails; its other blocks are then not run, other pages are.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import tyro
+
+from jaxouter import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NOT_RUN = re.compile(r"<!-- not run: (.+?) -->\s*\Z")
+RUN = ("bash", "python")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run the code blocks of the documentation, each page in a copy of this checkout."""
+
+    pages: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Markdown files of this checkout; default: all in docs."""
+
+
+class Block(NamedTuple):
+    """A code block of a page."""
+
+    language: str
+    text: str
+    line: int  # where its text begins, from 1
+    why_not: str  # '' where it is run
+
+
+class Outcome(NamedTuple):
+    """What became of a page."""
+
+    run: int
+    not_run: int
+    minutes: float
+    failed: bool
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    with cli.user_errors():
+        given = tyro.cli(Options, prog="python scripts/docs.py", args=arguments).pages
+        pages = [inside(page) for page in given] or sorted(page.relative_to(ROOT) for page in ROOT.glob("docs/**/*.md"))
+        listed = {page: blocks((ROOT / page).read_text()) for page in pages}
+    with tempfile.TemporaryDirectory(prefix="jaxouter-docs-") as place:
+        outcomes = [
+            outcome(page, found, Path(place)) for page, found in listed.items() if any(not b.why_not for b in found)
+        ]
+    failed = sum(each.failed for each in outcomes)
+    print(
+        f"{len(outcomes)} pages with {sum(each.run for each in outcomes)} blocks, {failed} failed; "
+        f"{sum(each.not_run for each in outcomes)} blocks not run; {sum(each.minutes for each in outcomes):.1f} minutes"
+    )
+    raise SystemExit(failed > 0)
+
+
+def inside(page: Path) -> Path:
+    """The page, from the root of the checkout.
+
+    Raises:
+        ValueError: it is no file of the checkout.
+    """
+    path = page.resolve()
+    if not (path.is_file() and path.is_relative_to(ROOT)):
+        raise ValueError(f"{page} is not a file of this checkout; pages lie in docs")
+    return path.relative_to(ROOT)
+
+
+def blocks(markdown: str) -> list[Block]:
+    """The blocks of a page in Bash and Python."""
+    found = []
+    for match in FENCE.finditer(markdown):
+        why_not = NOT_RUN.search(markdown, 0, match.start())
+        line = markdown.count("\n", 0, match.start(2)) + 1
+        if match[1] in RUN:
+            found.append(Block(match[1], match[2], line, why_not[1] if why_not else ""))
+    return found
+
+
+def program(page: Path, found: Sequence[Block]) -> str:
+    """Python that runs the blocks of a page; tracebacks name its lines."""
+    lines = ["import subprocess", 'names = {"__name__": "__main__"}']
+    for block in found:
+        where = f"{page}:{block.line}"
+        if block.why_not:
+            lines.append(f"print({f'-- {where} not run: {block.why_not}'!r}, flush=True)")
+            continue
+        lines.append(f"print({f'-- {where}'!r}, flush=True)")
+        if block.language == "bash":
+            lines.append(f"if subprocess.run(['bash', '-euo', 'pipefail', '-c', {block.text!r}]).returncode:")
+            lines.append(f"    raise SystemExit({f'{where} failed'!r})")
+        else:
+            source = "\n" * (block.line - 1) + block.text
+            lines.append(f"exec(compile({source!r}, {str(page)!r}, 'exec'), names)")
+    return "\n".join(lines)
+
+
+def outcome(page: Path, found: Sequence[Block], place: Path) -> Outcome:
+    """Run a page in a copy of its own, with results of rivals and compiled functions kept from page to page only."""
+    print(f"== {page}", flush=True)
+    copy, begun = place / "checkout", time.monotonic()
+    copied(copy)
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(copy),
+        "XDG_CACHE_HOME": str(place / "cache"),
+    }
+    failed = subprocess.run([sys.executable, "-c", program(page, found)], cwd=copy, env=environment).returncode != 0
+    shutil.rmtree(copy)
+    run = sum(not block.why_not for block in found)
+    minutes = (time.monotonic() - begun) / 60
+    print(f"== {page} {'FAILED' if failed else 'done'} in {minutes:.1f} minutes", flush=True)
+    return Outcome(run, len(found) - run, minutes, failed)
+
+
+def copied(copy: Path) -> None:
+    """Make a copy of the checkout: what git knows of, and what is new and not ignored."""
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    for name in filter(None, listing.stdout.split("\0")):
+        if (ROOT / name).is_file():  # else it is deleted, and not yet committed
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, copy / name)
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,127 @@
+"""The site: it builds, says where all of it is, and needs no network; its code blocks are found and run."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.load import ROOT, load
+
+docs = load("scripts", "docs")
+pages = load("scripts", "pages")
+FROM_ELSEWHERE = re.compile(
+    r"""<(?:script|link|img|iframe)[^>]*\b(?:src|href)="?(?:https?:)?//|url\(["']?https?:|@import"""
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built strictly: a link, an anchor or a page of nav that is missing ends it."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    return folder
+
+
+def test_every_page_is_in_nav(site):
+    nav = re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text())
+    found = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert set(nav) == found | {"reference/commands.md"}
+    assert all((site / page).with_suffix(".html").is_file() for page in nav)
+
+
+def test_no_page_asks_the_network(site):
+    for path in [*site.rglob("*.html"), *site.rglob("*.css")]:
+        assert FROM_ELSEWHERE.findall(path.read_text()) == [], path
+
+
+def test_what_is_kept_elsewhere_is_shown(site):
+    commands = (site / "reference" / "commands.html").read_text()
+    assert all(f'id="{name}"' in commands for name in ("check", "compare", "evaluate", "export", "train"))
+    assert "--pretraining.gradient-steps" in commands
+    assert (site / "results" / "heaters-default.png").is_file()
+    reproduction, explanation = ((site / f"{name}.html").read_text() for name in ("reproduction", "explanation"))
+    assert "pitch/delay-swapped</td>" in reproduction
+    assert "{{" not in re.sub(r"<code.*?</code>", "", reproduction + explanation, flags=re.DOTALL)
+    plants = (site / "reference" / "plants.html").read_text()
+    assert "thermal mass of the air, kWh/degC" in plants  # a comment of a field
+
+
+def test_a_figure_that_is_not_there_ends_the_build():
+    assert pages.figure("mae", "none", "pitch/paper") == "10.9"
+    with pytest.raises(ValueError, match="there is no mae of magic on pitch/paper"):
+        pages.figure("mae", "magic", "pitch/paper")
+
+
+PAGE = """# Page
+
+```bash
+echo one >file
+```
+
+```text
+nothing
+```
+
+<!-- not run: it fails -->
+```python
+1 / 0
+```
+
+```python
+a = open("file").read().strip()
+```
+
+```bash
+cat file
+```
+
+```python
+print(a, __name__)
+```
+"""
+
+
+def run(markdown, tmp_path):
+    program = docs.program(Path("page.md"), docs.blocks(markdown))
+    return subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+
+
+def test_blocks_are_run_in_their_order_and_share_names(tmp_path):
+    assert [block[2:] for block in docs.blocks(PAGE) if block.language == "python"] == [
+        (13, "it fails"), (17, ""), (25, "")
+    ]  # fmt: skip
+    done = run(PAGE, tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "-- page.md:13 not run: it fails" in done.stdout
+    assert "one\n" in done.stdout.split("page.md:21")[1]
+    assert done.stdout.endswith("one __main__\n")
+
+
+@pytest.mark.parametrize(
+    ("block", "text"),
+    [("bash\nfalse\ntrue", "page.md:2 failed"), ("bash\nfalse | cat", "page.md:2 failed"), ("python\n1 / 0", "line 2")],
+)
+def test_a_block_that_fails_ends_its_page(tmp_path, block, text):
+    done = run(f"```{block}\n```\n\n```bash\necho more\n```\n", tmp_path)
+    assert done.returncode == 1
+    assert text in done.stderr
+    assert "more" not in done.stdout
+
+
+def test_a_page_is_run_in_a_copy_of_its_own(tmp_path):
+    markdown = "```bash\ntest -f jaxouter/train.py\n! test -e runs\nmkdir runs\n```\n"
+    for _ in range(2):
+        done = docs.outcome(Path("page.md"), docs.blocks(markdown), tmp_path)
+        assert (done.run, done.not_run, done.failed) == (1, 0, False)
+
+
+def test_pages_that_are_none_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        docs.main(["/etc/passwd"])
+    assert "/etc/passwd is not a file of this checkout" in capsys.readouterr().err
