@@ -76,6 +76,8 @@ class Teacher:
     @classmethod
     def of(cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int) -> Teacher:
         """The teacher with the disturbances and the cost of a configuration."""
+        if plant.move_threshold is None and config.move_threshold:
+            plant = replace(plant, move_threshold=config.move_threshold * policy.observer.y_scale)
         return cls(plant, policy, batch, config.noise, config.load, config.log_above)
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
@@ -247,7 +249,7 @@ def rehearse(
     longer = config.gradient_steps  # from this step on
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
-        schools.append(replace(schools[0], plant=replace(plant, episode_steps=config.episode_steps)))
+        schools.append(replace(schools[0], plant=replace(schools[0].plant, episode_steps=config.episode_steps)))
     white = schools[0].whitening(prior, plant_params, key_white)
     rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
     while (done := int(at.done)) < config.gradient_steps:

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxouter import plants
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import counterfactual, identify
+from jaxouter.loop.policy import AffineParams
 from jaxouter.training.config import PretrainingConfig
+from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import ADAM, Teacher, Whitening
 from jaxouter.training.run import Run, RunWarning
 from jaxouter.training.train import train
@@ -93,6 +96,23 @@ def test_costs_count_by_their_logarithm_where_asked(config):
         )
 
     assert cost(0.1) == pytest.approx(0.1 * np.log1p(cost(0.0) / 0.1), rel=1e-4)
+
+
+def test_moves_are_charged_where_the_plant_declares_no_threshold(config):
+    """In half the set-point range; to a plant that declares one it is nothing."""
+    trainer, params = build(config)
+    plant, observer = trainer.env.plant, trainer.env.observer
+    actor = jax.tree.map(jnp.zeros_like, trainer.learner.init(KEY).actor)
+    offset, slope = jnp.asarray(0.0, float), jnp.asarray(4.0, float)
+
+    def cost(declared, threshold):
+        start = replace(START, move_threshold=threshold)
+        school = Teacher.of(start, replace(plant, move_threshold=declared), trainer.policy, 1)
+        learned = LearnedParams(actor, AffineParams(slope, offset))
+        return -float(school.episode(school.policy, learned, params.plant, jax.random.key(3))[0])
+
+    assert observer.y_scale == 1.0
+    assert cost(None, 0.3) == cost(0.3, 0.0) == cost(0.3, 0.1) > cost(None, 0.0) == cost(1e6, 0.3)
 
 
 def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
