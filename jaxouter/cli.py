@@ -20,7 +20,7 @@ from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants.sources import FORMS, Source, add
-from jaxouter.training.config import PRESETS, TrainConfig
+from jaxouter.training.config import OWN, PRESETS, TrainConfig
 from jaxouter.training.run import RunWarning
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
@@ -66,7 +66,7 @@ def print_lists() -> None:
     """Plants, presets, scenarios, sweeps and policies."""
     for name in plants.REGISTRY:
         console.print(f"[bold]{name}[/bold]")
-        console.print("  presets:   " + ", ".join(PRESETS.get(name, PRESETS["pitch"])))
+        console.print("  presets:   " + ", ".join(PRESETS.get(name, OWN)))
         console.print("  scenarios: " + ", ".join(scenarios.catalogue(name)))
         console.print("  sweeps:    " + ", ".join(sweeps.catalogue(name)))
     console.print("plants of your own: " + FORMS)

@@ -38,6 +38,10 @@ class PretrainingConfig:
     """Largest standard deviation of the measurement noise that half of these have; 1 is half the set-point range."""
     load: float = 0.0
     """Largest unseen step of r~, at a random time, that half of these have; 1 is half the range of r~."""
+    move_threshold: float = 0.0
+    """Moves of r~ and of y from this size on are charged, where the plant declares no such threshold; 1 is half the
+    set-point range; 0: they are free. Where they are, r~ may come to swing from bound to bound at every step, and no
+    gradient leads from there."""
     log_above: float = 0.0
     """Cost a step c above which episodes count less, as c log(1 + cost / c): so those of plants that are hard to hold
     don't outweigh all others; 0: each counts in full."""
@@ -46,7 +50,7 @@ class PretrainingConfig:
         """Raises ValueError, naming field, value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
-        for name in ("noise", "load", "log_above"):
+        for name in ("noise", "load", "move_threshold", "log_above"):
             if getattr(self, name) < 0:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must not be negative")
         for name in ("episodes", "plants", "episode_steps", "lags", "batch_size"):
@@ -271,6 +275,10 @@ ROBUST_HEATERS = replace(
     ),
     pretraining=replace(HEATERS.pretraining, gradient_steps=5_000, episodes=1_024, plants=128),
 )
+OWN = {
+    "default": replace(DEFAULT, pretraining=replace(DEFAULT.pretraining, move_threshold=0.2)),
+    "paper": PAPER,
+}
 PRESETS: dict[str, dict[str, TrainConfig]] = {
     "pitch": {"default": DEFAULT, "robust": ROBUST_PITCH, "paper": PAPER},
     "heaters": {
@@ -282,13 +290,13 @@ PRESETS: dict[str, dict[str, TrainConfig]] = {
 
 
 def preset(plant: str, name: str = "default") -> TrainConfig:
-    """The preset called `name` of a plant; a plant without presets of its own takes those of pitch.
+    """The preset called `name` of a plant; a plant of one's own takes `OWN`.
 
     Raises:
         ValueError: unknown plant or preset; lists those that exist.
     """
     plants.resolve(plant)
-    presets = PRESETS.get(plant, PRESETS["pitch"])
+    presets = PRESETS.get(plant, OWN)
     if name not in presets:
         raise ValueError(f"there is no preset {name!r} for {plant}; the presets are: {', '.join(presets)}")
     return replace(presets[name], plant=plant)

@@ -3,7 +3,9 @@ from dataclasses import replace
 
 import pytest
 
-from jaxouter.training.config import PRESETS, PretrainingConfig, from_dict, preset, to_dict
+from jaxouter import plants
+from jaxouter.training.config import OWN, PRESETS, PretrainingConfig, from_dict, preset, to_dict
+from tests import lag
 
 EVERY = [(plant, name) for plant, presets in PRESETS.items() for name in presets]
 
@@ -54,6 +56,14 @@ def test_errors_name_field_value_and_what_is_allowed(change, text):
 def test_unknown_preset_lists_those_that_exist():
     with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, robust, paper"):
         preset("heaters", "fast")
+
+
+def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
+    monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
+    for name in OWN:
+        assert preset("lag", name).check() == replace(OWN[name], plant="lag")
+    with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, paper"):
+        preset("lag", "robust")
 
 
 def test_configuration_with_an_unknown_field_is_refused():
