@@ -53,7 +53,6 @@ class Outcome(NamedTuple):
     """What became of a page."""
 
     run: int
-    not_run: int
     minutes: float
     failed: bool
 
@@ -69,9 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             outcome(page, found, Path(place)) for page, found in listed.items() if any(not b.why_not for b in found)
         ]
     failed = sum(each.failed for each in outcomes)
+    not_run = sum(bool(block.why_not) for found in listed.values() for block in found)
     print(
         f"{len(outcomes)} pages with {sum(each.run for each in outcomes)} blocks, {failed} failed; "
-        f"{sum(each.not_run for each in outcomes)} blocks not run; {sum(each.minutes for each in outcomes):.1f} minutes"
+        f"{not_run} blocks not run; {sum(each.minutes for each in outcomes):.1f} minutes"
     )
     raise SystemExit(failed > 0)
 
@@ -132,7 +132,7 @@ def outcome(page: Path, found: Sequence[Block], place: Path) -> Outcome:
     run = sum(not block.why_not for block in found)
     minutes = (time.monotonic() - begun) / 60
     print(f"== {page} {'FAILED' if failed else 'done'} in {minutes:.1f} minutes", flush=True)
-    return Outcome(run, len(found) - run, minutes, failed)
+    return Outcome(run, minutes, failed)
 
 
 def copied(copy: Path) -> None:
