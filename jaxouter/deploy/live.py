@@ -146,6 +146,12 @@ class Live:
         learner = fresh.learner._replace(actor=actor, critics=critics, target_actor=copies[0], target_critics=copies[1])
         return fresh._replace(learner=learner, prior=state.prior, begun=jnp.ones((), bool))
 
+    def stage(self, state: LiveState) -> Stage:
+        """What decides where nothing is wrong."""
+        if not state.begun:
+            return "recording"
+        return "learned" if int(state.learner.updates) >= self.takeover else "static"
+
     @partial(jax.jit, static_argnums=0)
     def first(self, r: jax.Array, y: jax.Array) -> Sample:
         """What stands before the first sample: the loop at rest at y."""
@@ -304,5 +310,6 @@ def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[Trai
     said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
     plant, _ = arx.make(FOLLOWS, [FOLLOWS], name=NAME, time_unit="s", history=HISTORY, **said)
     observer = Observer.of(plant)
-    config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale)
+    ddpg = replace(DEFAULT.ddpg, hidden=(64, 64), batch_size=128, discount=0.95)  # an update fits into milliseconds
+    config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale, ddpg=ddpg)
     return config, Environment(plant, observer, SetPoint(*plant.setpoint_range))

@@ -22,7 +22,8 @@ RESERVE = 0.1  # of a period, which updates leave alone
 FORGET = 0.9  # of what an update was last seen to take at most
 NAP = 0.2  # s, longest sleep before looking whether to stop
 LATELY = 200  # control steps, time constant of the mean errors that are compared
-WORSE, SLACK = 1.25, 0.02  # as large, and so much of half the set-point range: errors that send what was learned back
+BETTER = 0.9  # errors as large as those of the static inverse let what was learned take over
+WORSE, SLACK = 1.25, 0.02  # as large, and so much of half the set-point range more: they send it back
 
 
 class StepError(Exception):
@@ -96,7 +97,8 @@ class Loop:
         self.act_seconds = array("f")
         self.sent_back = 0  # times that what was learned was worse than the static inverse
         self.trouble: str | None = None  # why there is no static inverse yet
-        self._state, self._plant, self._reference, self._clock = state, plant, reference, clock
+        self._state = state if settings.learn else state._replace(noise=jnp.zeros_like(state.noise))
+        self._plant, self._reference, self._clock = plant, reference, clock
         self._counts = dict(zip(WHYS, np.asarray(state.counts).tolist(), strict=True))
         self._float = np.dtype(jnp.result_type(float)).type
         self._stage: Stage = live.stage(state)
@@ -115,7 +117,12 @@ class Loop:
         self._y_others = np.zeros(3)
         self._compile()
         self._fastest = self._longest = self._update_takes() if settings.learn else 0.0
-        self._begin, self._period, self._origin = begin, 0, clock()
+        self._begin, self._period = begin, 0
+        self.start()
+
+    def start(self) -> None:
+        """The next step is due now."""
+        self._origin = self._clock() - self._period * self.settings.dt
 
     @property
     def steps(self) -> int:
@@ -161,14 +168,15 @@ class Loop:
         y = self._measured()
         begun = self._clock()
         fault: Why | None = self._watch.judge(r, y, None)
-        seen = [self._float(value) for value in self._watch.within()]
+        r_seen, y_seen = (self._float(value) for value in self._watch.within())
         if not self._met:
-            before = self.live.first(*seen)
+            before = self.live.first(r_seen, y_seen)
             self._met = fault is None
-        memory, offered = self.live.act(self._state.learner.actor, self._state.prior, before, self._state.noise, *seen)
+        known = self._state.learner.actor, self._state.prior, before, self._state.noise
+        memory, offered = self.live.act(*known, r_seen, y_seen)
         wanted = {"recording": r} | dict(zip(("static", "learned"), np.asarray(offered).tolist(), strict=True))
         self._period += 1
-        if fault is None and (self.left < 0.0 or (skipped and self._unbroken)):
+        if self.left < 0.0 or (skipped and self._unbroken):
             fault = "late"
         elif fault is None and not math.isfinite(wanted[self._stage]):
             fault = "not finite"
@@ -176,7 +184,7 @@ class Loop:
         self.act_seconds.append(self._clock() - begun)
         why = fault or self._stage
         self._counts[why] += 1
-        y_others = self._note(before, memory, *seen, fault is None)
+        y_others = self._note(before, memory, r_seen, y_seen, fault is None)
         return Row(k, round(self._begin + due * dt, 9), r, y, self._r_tilde, why, *y_others)
 
     def learn(self) -> None:
@@ -195,7 +203,11 @@ class Loop:
             self._state = self._state._replace(learner=jax.block_until_ready(learner))
             self._updates += 1
             self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
-        if self._stage == "static" and self._updates >= self._takeover_at and self._errors[3] < self._errors[2]:
+        if (
+            self._stage == "static"
+            and self._updates >= self._takeover_at
+            and self._errors[3] < BETTER * self._errors[2]
+        ):
             self._errors[0] = self._errors[2]
             self._enter("learned")
 
@@ -226,10 +238,12 @@ class Loop:
 
     def _enter(self, stage: Stage) -> None:
         self._stage, self._transfer = stage, self._from_here()
+
     def _note(self, before: Sample, memory: Any, r: Any, y: Any, fine: bool) -> Sequence[float | None]:
         """The step becomes past, and what came of the one before is kept; y of the others."""
         state, follows = self._state._replace(sample=before), fine and self._unbroken
-        now = Sample(memory, r, y, self._float(self._r_tilde), np.int32(before.age + 1 if follows else 0))
+        age: Any = np.int32(before.age + 1 if follows else 0)
+        now = Sample(memory, r, y, self._float(self._r_tilde), age)
         self._unbroken = fine
         if not (self.settings.learn or self._known):
             self._state = state._replace(sample=now)
@@ -321,6 +335,7 @@ def run(
     """
     end = math.inf if steps is None else loop.steps + steps
     with _no_garbage():
+        loop.start()
         while loop.steps < end:
             while not stop() and (left := loop.left) > 0.0:
                 sleep(min(left, NAP))

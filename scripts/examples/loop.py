@@ -1,7 +1,7 @@
 """A slow closed loop as a bare function, for the real-time loop around it.
 
-    python -m jaxouter.live scripts/examples/loop.py:step --run runs/loop --dt 0.02 --learn \\
-        --r-tilde-bounds 0 10 --setpoint-range 2 6 --steps 3000
+    python -m jaxouter.live scripts/examples/loop.py:step --run runs/loop --dt 0.02 --steps 3000
+        --learn --r-tilde-bounds 0 10 --setpoint-range 2 6
 
 `step` is what you write for a loop of your own: show it r~, give back y as it is measured now. This one is simulated in
 plain Python: y comes to 1 + 0.7 r~ with a time constant of 15 periods, 3 periods late, and the sensor is noisy.
