@@ -277,15 +277,16 @@ class Live:
         if log.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
             told = ", ".join(f"{each:.3g}" for each in gains)
             raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
-        slope, level = 1.0 / gains[0], log.offset(whole)
-        prior = AffineParams(jnp.asarray(slope, float), jnp.asarray(-level * slope, float))
-        return prior, Response(jnp.asarray(whole.a, float), jnp.asarray(whole.b, float))
+        dtype = jnp.result_type(float)
+        found = (1.0 / gains[0], -log.offset(whole) / gains[0], whole.a, whole.b)
+        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
+        return AffineParams(slope, offset), Response(a, b)
 
     def _record(self, replay: ReplayState) -> Record:
         """Windows of H steps of the loop without interruption, each with the y after it."""
         layout, written = self.trainer.replay, int(replay.written)
         recent = np.arange(max(0, written - min(RECENT, layout.steps - layout.mirror)), written)
-        rows = np.asarray(replay.rows[0])[recent % layout.steps + layout.mirror].astype(np.float64)
+        rows = np.asarray(replay.rows)[0, recent % layout.steps + layout.mirror].astype(np.float64)
         field, n = dict(zip(FIELDS, rows.T, strict=True)), self.observer.history
         ends = np.flatnonzero(field["age"][n - 1 :] >= n - 1) + n - 1
         windows = ends[:, None] + np.arange(1 - n, 1)

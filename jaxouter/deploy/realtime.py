@@ -284,7 +284,7 @@ class Loop:
         self.trouble = None
         if self._stage == "recording":
             replay = self.live.relabelled(self._state.replay, prior)
-            self._state = self._state._replace(replay=replay, prior=prior, begun=jnp.ones((), bool))
+            self._state = self._state._replace(replay=replay, prior=prior, begun=jax.device_put(np.True_))
             self._enter("static")
 
     def _compile(self) -> None:
