@@ -76,8 +76,9 @@ def print_lists() -> None:
 class Interrupt:
     """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can save itself; the second one ends it at once."""
 
-    def __init__(self) -> None:
-        self.requested = False
+    def __init__(self, first: str = "the epoch of all seeds ends, then everything is saved") -> None:
+        """Args: first: what happens before it ends."""
+        self.requested, self._first = False, first
 
     def __enter__(self) -> Interrupt:
         self._before: dict[int, Any] = {}
@@ -88,7 +89,7 @@ class Interrupt:
     def _handle(self, number: int, frame: Any) -> None:
         del frame
         self.requested = True
-        print("\nstopping: the epoch of all seeds ends, then everything is saved; once more: at once", file=sys.stderr)
+        print(f"\nstopping: {self._first}; once more: at once", file=sys.stderr)
         signal.signal(number, self._before[number])
 
     def __exit__(
@@ -194,6 +195,36 @@ class JobProgress:
         self._done += 1
         self._bar.advance(self._task)
         self.say(text)
+
+
+class Ticker:
+    """What goes on, in one line: live on a terminal, now and then elsewhere."""
+
+    def __init__(self) -> None:
+        self._status = console.status("")
+        self._seconds = 0.5 if console.is_terminal else LINE_SECONDS
+        self._last = time.monotonic()
+
+    def __enter__(self) -> Ticker:
+        if console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to say something."""
+        return time.monotonic() - self._last >= self._seconds
+
+    def __call__(self, text: str) -> None:
+        """Say it."""
+        self._last = time.monotonic()
+        if console.is_terminal:
+            self._status.update(text)
+        else:
+            print(text, flush=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

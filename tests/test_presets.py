@@ -1,14 +1,17 @@
 """The default presets reach what they promise (slow: each trains for a minute or two)."""
 
 import json
+from unittest.mock import patch
 
 import pytest
 
-from jaxouter import train
-from jaxouter.evaluation import scenarios
+from jaxouter import plants, train
+from jaxouter.evaluation import evaluate, scenarios
 from jaxouter.evaluation.metrics import held
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.plants import sources
 from jaxouter.training.run import Run
+from tests.load import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -30,6 +33,14 @@ def test_default_heaters_beat_the_paper_in_comfort(tmp_path):
     assert scenarios["heaters/paper-4"]["mae"] <= 0.90  # the paper 1.17
     assert scenarios["heaters/paper-1000"]["mae"] <= 0.80  # the paper 1.31
     assert scenarios["heaters/paper-1000"]["violation_time"] == 0.0
+
+
+def test_default_on_a_plant_of_ones_own_beats_static_and_pi_on_every_family(tmp_path):
+    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+        figures = learned(f"{ROOT}/scripts/examples/tanks.py:Tanks", tmp_path)
+        for rival in (evaluate.rival(name, "Tanks") for name in ("static", "pi")):
+            for identifier, (_, of_rival) in evaluate.evaluate(rival, map(scenarios.get, figures)).items():
+                assert figures[identifier]["mae"] < 0.5 * of_rival["mae"]
 
 
 @pytest.mark.parametrize("name", ["delay-0.57", "delay-swapped"])

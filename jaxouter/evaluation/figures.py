@@ -24,6 +24,7 @@ matplotlib.use("agg")
 INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"
 UNITS = {"degC": "°C"}
 HELD_OUT_ROWS = 600  # that are drawn
+LIVE_ROWS = 600  # the same, at either end
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -237,6 +238,35 @@ def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.nd
     above.set(ylabel=f"change of y, {unit}", title=f"{plant.name}: response to a move of r̃ at 0")
     below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
     above.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return save(figure, path)
+
+
+def live(path: Path, steps: Mapping[str, np.ndarray], unit: str = "1") -> Path:
+    """The beginning and the end of a live run: r, y and what y would have been, and r~.
+
+    Args:
+        path: PNG.
+        steps: time (s), r, y, r_tilde and y_passed, (T,) each; nan where there is none.
+        unit: of y.
+    """
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    grid = figure.subplots(2, 2, sharex="col", sharey="row", squeeze=False)
+    told = "" if unit in ("", "1") else f" [{symbol(unit)}]"
+    for column, (title, shown) in enumerate((("beginning", slice(LIVE_ROWS)), ("end", slice(-LIVE_ROWS, None)))):
+        t, r, y, r_tilde, passed = (steps[name][shown] for name in ("time", "r", "y", "r_tilde", "y_passed"))
+        above, below = grid[:, column]
+        above.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r")
+        if np.isfinite(passed).any():
+            above.plot(t, passed, color=INNER, lw=1.2, label="y, had r passed")
+        above.plot(t, y, color=LEARNED, lw=1.6, label="output y")
+        error = float(np.nanmean(np.abs(r[:-1] - y[1:]))) if len(t) > 1 else math.nan
+        above.set_title(f"{title}: MAE {error:.3g}{told}", fontsize=10, loc="left")
+        below.step(t, r_tilde, where="post", color=MODIFIED, lw=1.2, label="modified reference r̃")
+        below.set_xlabel("time [s]")
+    grid[0, 0].set_ylabel(f"y{told}")
+    grid[1, 0].set_ylabel(f"r̃{told}")
+    for axes in grid[:, 0]:
+        axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
     return save(figure, path)
 
 

@@ -38,10 +38,6 @@ class PretrainingConfig:
     """Largest standard deviation of the measurement noise that half of these have; 1 is half the set-point range."""
     load: float = 0.0
     """Largest unseen step of r~, at a random time, that half of these have; 1 is half the range of r~."""
-    move_threshold: float = 0.0
-    """Moves of r~ and of y from this size on are charged, where the plant declares no such threshold; 1 is half the
-    set-point range; 0: they are free. Where they are, r~ may come to swing from bound to bound at every step, and no
-    gradient leads from there."""
     log_above: float = 0.0
     """Cost a step c above which episodes count less, as c log(1 + cost / c): so those of plants that are hard to hold
     don't outweigh all others; 0: each counts in full."""
@@ -50,7 +46,7 @@ class PretrainingConfig:
         """Raises ValueError, naming field, value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
-        for name in ("noise", "load", "move_threshold", "log_above"):
+        for name in ("noise", "load", "log_above"):
             if getattr(self, name) < 0:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must not be negative")
         for name in ("episodes", "plants", "episode_steps", "lags", "batch_size"):
@@ -275,10 +271,7 @@ ROBUST_HEATERS = replace(
     ),
     pretraining=replace(HEATERS.pretraining, gradient_steps=5_000, episodes=1_024, plants=128),
 )
-OWN = {
-    "default": replace(DEFAULT, pretraining=replace(DEFAULT.pretraining, move_threshold=0.2)),
-    "paper": PAPER,
-}
+OWN = {"default": DEFAULT, "paper": PAPER}
 PRESETS: dict[str, dict[str, TrainConfig]] = {
     "pitch": {"default": DEFAULT, "robust": ROBUST_PITCH, "paper": PAPER},
     "heaters": {

@@ -1,0 +1,316 @@
+"""What acts and learns in a real-time loop: pure functions of parts of one state, jitted.
+
+From nothing r passes through while a record is made; then the static inverse of that record acts, and then what was
+learned on top of it. `jaxouter.deploy.realtime` is the loop in time.
+
+Once the response of y to a change of r~ is known, each live step is lived again by others: what y would have been under
+their own r~, and what they learn from it, cost the plant nothing (`jaxouter.loop.counterfactual`). Three of them tell
+what r passed through, the static inverse, and what was learned would have been worth; the rest explore.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple, get_args
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.agents import noise
+from jaxouter.agents.ddpg import DDPG, LearnerState
+from jaxouter.agents.replay import Replay, ReplayState
+from jaxouter.deploy.controller import Reason
+from jaxouter.loop import identify, log, rewards
+from jaxouter.loop.environment import Environment
+from jaxouter.loop.identify import Record
+from jaxouter.loop.observation import Memory, Observer, Signals
+from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.references import SetPoint
+from jaxouter.plants import arx
+from jaxouter.plants.arx import Model
+from jaxouter.plants.simulators import PlantOptions
+from jaxouter.training.config import DEFAULT, TrainConfig
+from jaxouter.training.policy import LearnedPolicy
+from jaxouter.training.trainer import FIELDS, Trainer, TrainState
+
+Stage = Literal["recording", "static", "learned"]
+Why = Stage | Reason
+WHYS: tuple[Why, ...] = (*get_args(Stage), "late", "missing", "not finite", "out of range")
+NAME = "live"
+FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y comes to r~ at once
+HISTORY = 8  # where nothing else is known
+COMPARED = 3  # of the others: r passes through; the static inverse; what was learned, without exploration
+EXPLORING = 12  # of the others
+REDRAW = 0.02  # probability that one of these gets another set-point at a step
+KEPT = 20_000  # control steps in the replay
+RECENT = 2_000  # of them, from which the response is identified
+AGREE = 0.2  # by which the gains of both halves of the record may differ, as share of that of the whole
+
+
+class Sample(NamedTuple):
+    """What came at t_k and what was answered; scalars but for the memory."""
+
+    memory: Memory  # e_k integrated
+    r: jax.Array
+    y: jax.Array
+    r_tilde: jax.Array
+    age: jax.Array  # int32, control steps since the last interruption
+
+
+class Response(NamedTuple):
+    """Of y to a change of r~: dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i); zero while it is not known."""
+
+    a: jax.Array  # (H,)
+    b: jax.Array  # (H,)
+
+
+class Others(NamedTuple):
+    """Who lives the same steps under another r~; each leaf (O, ...)."""
+
+    sample: Sample
+    dy: jax.Array  # (O, H), differences to what came, the newest first
+    dr_tilde: jax.Array  # (O, H)
+    noise: jax.Array  # (O,), exploration
+
+
+class LiveState(NamedTuple):
+    """Everything that a live loop changes."""
+
+    learner: LearnerState
+    replay: ReplayState
+    prior: AffineParams  # r~ of a zero action
+    begun: jax.Array  # bool, whether the prior is more than r~ = r
+    response: Response
+    sample: Sample  # the last one
+    others: Others
+    noise: jax.Array  # exploration, 1 is half the range of r~
+    key: chex.PRNGKey
+    counts: jax.Array  # (len(WHYS),), int32, control steps by what decided them
+
+
+@dataclass(frozen=True)
+class Live:
+    """What acts and learns. Static and hashable."""
+
+    trainer: Trainer  # of environments that nobody steps: the loop itself, and the others
+    takeover: int
+    """Updates before what was learned acts; 0: from the beginning."""
+
+    @classmethod
+    def of(cls, config: TrainConfig, env: Environment, takeover: int, critic_alone: int) -> Live:
+        """For the configuration and the environment of a run, or of `declared`.
+
+        Args:
+            config, env: learner, exploration and observation. The loop itself has the least exploration.
+            takeover: updates before what was learned acts.
+            critic_alone: updates before the actor moves.
+        """
+        ddpg = replace(config.ddpg, n_step=1, rate_decay="constant", actor_from=critic_alone)
+        config = replace(config, environments=1 + COMPARED + EXPLORING, ddpg=ddpg)
+        policy = LearnedPolicy(env.observer, DDPG(ddpg, env.observer.size))
+        replay = Replay(FIELDS, config.environments, KEPT, env.observer.history)
+        return cls(Trainer(config, env, policy, replay), takeover)
+
+    @property
+    def observer(self) -> Observer:
+        """What is seen."""
+        return self.trainer.env.observer
+
+    @partial(jax.jit, static_argnums=0)
+    def fresh(self, key: chex.PRNGKey) -> LiveState:
+        """Nothing is known: r~ = r."""
+        key, key_learner = jax.random.split(key)
+        zero, middle = jnp.zeros(()), jnp.asarray(self.observer.y_middle, float)
+        sample = self.first(middle, middle)
+        return LiveState(
+            learner=self.trainer.learner.init(key_learner),
+            replay=self.trainer.replay.init(),
+            prior=AffineParams(jnp.ones(()), zero),
+            begun=jnp.zeros((), bool),
+            response=Response(jnp.zeros(self.observer.history), jnp.zeros(self.observer.history)),
+            sample=sample,
+            others=self.gathered(sample),
+            noise=zero,
+            key=key,
+            counts=jnp.zeros(len(WHYS), jnp.int32),
+        )
+
+    def trained(self, key: chex.PRNGKey, state: TrainState) -> LiveState:
+        """Begin with what a run has learned; its optimisers and targets begin anew."""
+        fresh = self.fresh(key)
+        actor, critics = state.learner.actor, state.learner.critics
+        copies = jax.tree.map(jnp.copy, (actor, critics))  # the learner is donated, and no buffer twice
+        learner = fresh.learner._replace(actor=actor, critics=critics, target_actor=copies[0], target_critics=copies[1])
+        return fresh._replace(learner=learner, prior=state.prior, begun=jnp.ones((), bool))
+
+    def stage(self, state: LiveState) -> Stage:
+        """What decides where nothing is wrong."""
+        if not state.begun:
+            return "recording"
+        return "learned" if int(state.learner.updates) >= self.takeover else "static"
+
+    @partial(jax.jit, static_argnums=0)
+    def first(self, r: jax.Array, y: jax.Array) -> Sample:
+        """What stands before the first sample: the loop at rest at y."""
+        r_tilde = jnp.clip(y, *self.observer.r_tilde_bounds)
+        return Sample(self.observer.init(r, y), r, y, r_tilde, jnp.full((), -1, jnp.int32))
+
+    @partial(jax.jit, static_argnums=0)
+    def gathered(self, sample: Sample) -> Others:
+        """The others, each where the loop is."""
+        n, history = COMPARED + EXPLORING, self.observer.history
+        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), sample)
+        samples = samples._replace(age=jnp.full_like(samples.age, -1))
+        return Others(samples, jnp.zeros((n, history)), jnp.zeros((n, history)), jnp.zeros(n))
+
+    @partial(jax.jit, static_argnums=0)
+    def act(
+        self, actor: Any, prior: AffineParams, before: Sample, explore: jax.Array, r: jax.Array, y: jax.Array
+    ) -> tuple[Memory, jax.Array]:
+        """At t_k: the memory, and r~ of the static inverse and of the policy, both with exploration; (2,)."""
+        memory = self.observer.record(before.memory, before.y, before.r_tilde)
+        memory, obs = self.observer.observe(memory, r, y)
+        learned = self.trainer.learner.act(actor, obs)[0]
+        actions = jnp.clip(jnp.stack([jnp.zeros_like(learned), learned]) + explore, -1.0, 1.0)
+        return memory, jax.vmap(self.trainer.policy.r_tilde, (None, None, 0))(prior, r, actions)
+
+    @partial(jax.jit, static_argnums=0)
+    def relive(
+        self, state: LiveState, actor: Any, now: Sample, step: jax.Array
+    ) -> tuple[Others, jax.Array, jax.Array, jax.Array]:
+        """What t_k is to the loop and to the others.
+
+        Args:
+            state: before t_k; its learner and replay are not looked at.
+            actor: of the others.
+            now: the sample of t_k.
+            step: k, uint32.
+
+        Returns:
+            The others; the loop's next exploration noise; rows (E, width) for the replay, of the step up to t_k; and y
+            (3,) of those that are compared. While the response is not known, each row is that of the loop.
+        """
+        key_noise, key_when, key_r = jax.random.split(jax.random.fold_in(state.key, step), 3)
+        config, (low, high), n = self.trainer.config, self.trainer.env.plant.setpoint_range, COMPARED + EXPLORING
+        others, before = state.others, state.others.sample
+        compared = jnp.arange(n) < COMPARED
+        other_r = jax.random.uniform(key_r, (n,), float, low, high)
+        redrawn = jax.random.uniform(key_when, (n,), float) < REDRAW
+        r = jnp.where(compared, now.r, jnp.where(redrawn, other_r, before.r))
+        y = now.y + others.dy[:, 0]
+
+        sigma = jnp.geomspace(*config.noise_sigma, 1 + EXPLORING)
+        before_noise = jnp.append(state.noise, others.noise[COMPARED:])
+        normal = jax.random.normal(key_noise, before_noise.shape, before_noise.dtype)
+        explore = noise.ornstein_uhlenbeck(before_noise, normal, config.noise_theta, sigma)
+        other_noise = jnp.concatenate([jnp.zeros(COMPARED), explore[1:]])
+
+        memory, r_tilde = jax.vmap(self.act, (None, None, 0, 0, 0, 0))(actor, state.prior, before, other_noise, r, y)
+        passed = jnp.clip(now.r, *self.observer.r_tilde_bounds)
+        r_tilde = r_tilde[:, 1].at[:2].set(jnp.stack([passed, r_tilde[1, 0]]))
+        dr_tilde = jnp.column_stack([r_tilde - now.r_tilde, others.dr_tilde[:, :-1]])
+        dy = jnp.column_stack([others.dy @ state.response.a + dr_tilde @ state.response.b, others.dy[:, :-1]])
+        row = self.row(state.prior, state.sample, now.r, now.y)
+        known = jnp.any(state.response.b != 0.0)
+        rows = jnp.where(known, jax.vmap(self.row, (None, 0, 0, 0))(state.prior, before, r, y), row[None])
+        age = jnp.where(now.age == 0, 0, before.age + 1)
+        others = Others(Sample(memory, r, y, r_tilde, age), dy, dr_tilde, other_noise)
+        return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED]
+
+    def row(self, prior: AffineParams, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
+        """The replay's row of the step from the sample before to r and y; (width,)."""
+        signals = Signals(
+            r=before.r,
+            y=before.y,
+            integral=before.memory.integral,
+            r_tilde=before.r_tilde,
+            age=before.age.astype(y.dtype),
+            r_next=r,
+            y_next=y,
+        )
+        earlier, price = before.memory.r_tilde_past[0], rewards.params(self.trainer.env.plant)
+        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier)
+        action, never = self._action(prior, before.r, before.r_tilde), jnp.zeros_like(y)
+        return jnp.stack([*signals, action, self.trainer.config.reward_scale * reward, never, never])
+
+    def _action(self, prior: AffineParams, r: jax.Array, r_tilde: jax.Array) -> jax.Array:
+        """The action of which r~ comes; beyond [-1, 1] where r passed through."""
+        low, high = self.observer.r_tilde_bounds
+        return (r_tilde - prior.offset - prior.slope * r) / ((high - low) / 2)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def write(self, replay: ReplayState, rows: jax.Array) -> ReplayState:
+        """The replay with one row more of each."""
+        return self.trainer.replay.write(replay, rows)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def relabelled(self, replay: ReplayState, prior: AffineParams) -> ReplayState:
+        """The replay with its actions in terms of another prior."""
+        r, r_tilde, place = (FIELDS.index(name) for name in ("r", "r_tilde", "action"))
+        action = self._action(prior, replay.rows[..., r], replay.rows[..., r_tilde])
+        return replay._replace(rows=replay.rows.at[..., place].set(action.astype(jnp.float32)))
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def update(self, learner: LearnerState, replay: ReplayState, key: chex.PRNGKey) -> LearnerState:
+        """One update from the replay."""
+        key_batch, key_update = jax.random.split(jax.random.fold_in(key, learner.updates))
+        bits = jax.random.bits(key_batch, (self.trainer.config.ddpg.batch_size, 2), jnp.uint32)
+        return self.trainer.learner.update(learner, self.trainer.batch(replay, bits), key_update)[0]
+
+    def identify(self, replay: ReplayState) -> tuple[AffineParams, Response]:
+        """By a linear model of the last steps: the static inverse, r~ = (r - offset) / gain, and the response.
+
+        Raises:
+            ValueError: they do not tell it.
+        """
+        data = self._record(replay)
+        half, least = len(data.y) // 2, 4 * data.y.shape[1]
+        if half < least:
+            raise ValueError(f"{len(data.y)} steps without interruption are too few; it takes {2 * least}")
+        if np.ptp(data.r_tilde) == 0.0:
+            raise ValueError("r~ has not moved")
+        whole, *halves = (_model(Record(*(x[part] for x in data))) for part in (slice(None), *_halves(half)))
+        gains = [log.gain(model) for model in (whole, *halves)]
+        if log.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
+            told = ", ".join(f"{each:.3g}" for each in gains)
+            raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
+        dtype = jnp.result_type(float)
+        found = (1.0 / gains[0], -log.offset(whole) / gains[0], whole.a, whole.b)
+        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
+        return AffineParams(slope, offset), Response(a, b)
+
+    def _record(self, replay: ReplayState) -> Record:
+        """Windows of H steps of the loop without interruption, each with the y after it."""
+        layout, written = self.trainer.replay, int(replay.written)
+        recent = np.arange(max(0, written - min(RECENT, layout.steps - layout.mirror)), written)
+        rows = np.asarray(replay.rows)[0, recent % layout.steps + layout.mirror].astype(np.float64)
+        field, n = dict(zip(FIELDS, rows.T, strict=True)), self.observer.history
+        ends = np.flatnonzero(field["age"][n - 1 :] >= n - 1) + n - 1
+        windows = ends[:, None] + np.arange(1 - n, 1)
+        return Record(field["r_tilde"][windows], np.column_stack([field["y"][windows], field["y_next"][ends]]))
+
+
+def _halves(half: int) -> tuple[slice, slice]:
+    return slice(half), slice(half, None)
+
+
+def _model(data: Record) -> Model:
+    found = identify.fit_arx(data, data.r_tilde.shape[1], 0)
+    return Model(found.a, found.b, found.c, found.sigma)
+
+
+def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[TrainConfig, Environment]:
+    """Learner and declaration of a loop of which nothing is known but its ranges.
+
+    Raises:
+        ValueError: the ranges are none.
+    """
+    said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
+    plant, _ = arx.make(FOLLOWS, [FOLLOWS], name=NAME, time_unit="s", history=HISTORY, **said)
+    observer = Observer.of(plant)
+    ddpg = replace(DEFAULT.ddpg, hidden=(64, 64), batch_size=128, discount=0.95)  # an update fits into milliseconds
+    config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale, ddpg=ddpg)
+    return config, Environment(plant, observer, SetPoint(*plant.setpoint_range))

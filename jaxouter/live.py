@@ -1,0 +1,181 @@
+"""`python -m jaxouter.live`: act on a loop in real time, and learn from it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from jaxouter import cli
+from jaxouter.deploy.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
+from jaxouter.deploy.realtime import Loop, Row, Settings, StepError, run
+from jaxouter.evaluation import figures
+from jaxouter.plants.sources import attribute
+from jaxouter.training.run import add_plant, write_json
+
+SHOWN = dict(zip(SIGNALS, ("y", "had r passed", "static inverse", "learned"), strict=True))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Put an outer loop around a function step(r~) -> y, once every DT seconds, and learn from what comes.
+
+    With a trained run its policy acts; with --learn it learns on. Where there is no such run, --learn begins from
+    nothing: r passes through while a record is made, then the static inverse acts, then what was learned, as soon as
+    the record tells that it is better. A missed deadline passes r for that step.
+
+    State, a row a step, a summary and a picture go to RUN/live; the same command goes on from there. Ctrl-C saves.
+    """
+
+    step: Annotated[str, tyro.conf.Positional]
+    """FILE.py:NAME or MODULE:NAME of a function that shows the loop r~ and gives y as it is then measured, or None."""
+    run: Path
+    """Run folder, or the folder of one seed in it; or one that is not there yet."""
+    declaration: Annotated[Declaration, tyro.conf.arg(name="")]
+    learn: bool = False
+    """Learn from what comes, in the time that is left of each period; r~ then explores a little."""
+    steps: int | None = None
+    """Control steps; default: until Ctrl-C."""
+    reference: str = "staircase"
+    """r: a number, a CSV file with a column r (a row a period, then from its beginning), or a family of random
+    references: steps, staircase, ramps, sines, doublets, days."""
+    record: int = 500
+    """Control steps of which a record is made before it is looked at."""
+    updates: int = 8
+    """Most updates a period."""
+    plant: str | None = None
+    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    with cli.user_errors(), ExitStack() as stack:
+        options = tyro.cli(Options, prog="python -m jaxouter.live", args=arguments)
+        plant = check(options)
+        if options.plant is not None:
+            add_plant(options.plant, options.run)
+        folder = open_folder(options.run, options.declaration, options.learn)
+        cli.use_compilation_cache()
+        live, state = folder.begin()
+        said, declared = folder.declaration, live.trainer.env.plant
+        r = reference(options.reference, declared.setpoint_range, said.episode_steps, said.seed)
+        stack.enter_context(folder.lock(live))
+        settings = Settings(said.dt, options.learn, options.record, options.updates)
+        before = folder.columns().get("time", np.zeros(0))
+        begin = float(before[-1]) + 2 * said.dt if len(before) else 0.0  # a gap, where it was stopped
+        loop = Loop(live, state, plant, lambda k: float(r[k % len(r)]), settings, begin)
+        if (declared.control_step, declared.time_unit) != (said.dt, "s"):
+            trained = f"{declared.control_step:g} {declared.time_unit}"
+            print(f"warning: the period is {said.dt:g} s; the policy was trained for {trained}", file=sys.stderr)
+        print(f"{options.step}, every {said.dt:g} s -> {folder.path}; r~ in {list(live.observer.r_tilde_bounds)}")
+        try:
+            stopped = go(folder, loop, options.steps)
+            report(folder, loop)
+        except OSError as error:
+            raise SystemExit(f"error: {error}; what was saved before is whole") from None
+    if stopped is not None:
+        print(f"{stopped}; saved, go on with the same command", file=sys.stderr)
+        raise SystemExit(130 if stopped == "stopped" else 1)
+
+
+def check(options: Options) -> Callable[[float], Any]:
+    """The function, if all else that can be found without work is right.
+
+    Raises:
+        ValueError: there is no such function, or a number is out of range.
+    """
+    for name, value in (("steps", options.steps), ("record", options.record), ("updates", options.updates)):
+        if value is not None and value < 1:
+            raise ValueError(f"--{name} is {value}; it must be at least 1")
+    file, colon, name = options.step.rpartition(":")
+    if not colon or not file:
+        raise ValueError(f"the function is {options.step!r}; it is named FILE.py:NAME or MODULE:NAME")
+    if file.endswith(".py"):
+        found = attribute(Path(file), name, "the function")
+    else:
+        try:
+            found = getattr(importlib.import_module(file), name)
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"{options.step} can't be imported: {error}") from None
+    if not callable(found):
+        raise ValueError(f"{options.step} is {found!r}; it must be a function of r~ that gives y")
+    return found
+
+
+def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
+    """Run, with progress, and save; why it ended early."""
+    stopped = None
+    with cli.Interrupt("everything is saved") as interrupt, cli.Ticker() as ticker, folder.rows() as rows:
+        tell = Telling(loop, ticker)
+
+        def heard(row: Row) -> None:
+            rows.writerow(row)
+            tell(row)
+
+        try:
+            run(loop, steps, lambda: interrupt.requested, heard)
+        except (StepError, OSError) as error:
+            stopped = f"error: {error}"
+        folder.save(loop)
+    return "stopped" if interrupt.requested else stopped
+
+
+class Telling:
+    """What goes on, and each change of the stage."""
+
+    def __init__(self, loop: Loop, ticker: cli.Ticker) -> None:
+        self._loop, self._ticker = loop, ticker
+        self._stage: str | None = None
+        self._errors: deque[float] = deque(maxlen=500)
+        self._r: float | None = None
+
+    def __call__(self, row: Row) -> None:
+        """After each step."""
+        loop = self._loop
+        if row.y is not None and self._r is not None:
+            self._errors.append(abs(self._r - row.y))
+        self._r = row.r
+        if loop.stage != self._stage:
+            self._stage = loop.stage
+            cli.console.print(f"step {row.step:,}: {self._stage}")
+        if self._ticker.due and self._errors:
+            trouble = "" if loop.trouble is None else f"  {loop.trouble}"
+            self._ticker(
+                f"{loop.steps:,} steps  {loop.stage}  |r - y| {np.mean(self._errors):.3g}  {loop.updates:,} updates  "
+                f"{loop.counts['late']:,} missed deadlines{trouble}"
+            )
+
+
+def report(folder: LiveFolder, loop: Loop) -> None:
+    """Summary, figure and table."""
+    if not loop.act_seconds:
+        return
+    columns = folder.columns()
+    found = summary(loop, columns)
+    write_json(folder.path / "summary.json", found)
+    unit = loop.live.trainer.env.plant.y_unit
+    figure = figures.live(folder.path / "live.png", columns, unit)
+    cli.table(
+        "MAE: of y, and of what it would have been on the same steps",
+        ["", *SHOWN.values()],
+        [[part, *(cli.number(values[name]) for name in SHOWN)] for part, values in found["mae"].items()],
+    )
+    passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)
+    act = found["act_us"]
+    print(
+        f"{found['steps']:,} steps ({passed}); {found['missed_deadlines']:,} missed deadlines; {found['updates']:,} "
+        f"updates; act takes {act['p50']:.0f} us (p50), {act['p99']:.0f} us (p99)"
+    )
+    print(f"figure: {figure}; summary, steps.csv and controller.npz beside it")
+
+
+if __name__ == "__main__":
+    cli.run(main)
