@@ -318,7 +318,8 @@ def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[Trai
         ValueError: the ranges are none.
     """
     said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
-    plant, _ = arx.make(FOLLOWS, [FOLLOWS], name=NAME, time_unit="s", history=HISTORY, **said)
+    said |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # each move of r~ has its price
+    plant, _ = arx.make(FOLLOWS, [FOLLOWS], **said)
     observer = Observer.of(plant)
     ddpg = replace(DEFAULT.ddpg, hidden=(64, 64), batch_size=128, discount=0.95)  # an update fits into milliseconds
     config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale, ddpg=ddpg)

@@ -43,7 +43,9 @@ class Declaration:
     takeover: int = 2_000
     """Updates before what is learned may act."""
     r_tilde_bounds: tuple[float, float] | None = None
+    """From nothing: least and greatest r~ that the loop may be shown."""
     setpoint_range: tuple[float, float] | None = None
+    """From nothing: between what r lies, as a rule; scales what is seen, and random references."""
 
     def check(self) -> None:
         """Raises ValueError, naming option, value and what is allowed."""
