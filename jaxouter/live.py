@@ -21,16 +21,16 @@ from jaxouter.evaluation import figures
 from jaxouter.plants.sources import attribute
 from jaxouter.training.run import add_plant, write_json
 
-SHOWN = dict(zip(SIGNALS, ("y", "had r passed", "static inverse", "learned"), strict=True))
+KEPT = {"static": "static inverse", "trained": "as trained"}
 
 
 @dataclass(frozen=True)
 class Options:
     """Put an outer loop around a function step(r~) -> y, once every DT seconds, and learn from what comes.
 
-    With a trained run its policy acts; with --learn it learns on. Where there is no such run, --learn begins from
-    nothing: r passes through while a record is made, then the static inverse acts, then what was learned, as soon as
-    the record tells that it is better. A missed deadline passes r for that step.
+    With a trained run its policy acts. Where there is no such run, --learn begins from nothing: r passes through while
+    a record is made, then the static inverse acts. What is learned takes over as soon as the record tells that it is
+    better, and goes back where it turns out worse. A missed deadline passes r for that step.
 
     State, a row a step, a summary and a picture go to RUN/live; the same command goes on from there. Ctrl-C saves.
     """
@@ -165,8 +165,8 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     figure = figures.live(folder.path / "live.png", columns, unit)
     cli.table(
         "MAE: of y, and of what it would have been on the same steps",
-        ["", *SHOWN.values()],
-        [[part, *(cli.number(values[name]) for name in SHOWN)] for part, values in found["mae"].items()],
+        ["", "y", "had r passed", KEPT[loop.live.kept], "learned"],
+        [[part, *(cli.number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
     )
     passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)
     act = found["act_us"]

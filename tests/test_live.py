@@ -58,7 +58,7 @@ def test_it_begins_from_nothing_in_real_time(begun):
 def test_the_rows_are_a_log_where_no_deadline_was_missed(begun):
     path = begun[1] / "live" / "steps.csv"
     lines = path.read_text().splitlines()
-    assert lines[0] == "step,time,r,y,r_tilde,why,y_passed,y_static,y_learned"
+    assert lines[0] == "step,time,r,y,r_tilde,why,y_passed,y_kept,y_learned"
     assert len(lines) == 501
     why = [line.split(",")[5] for line in lines[1:]]
     if "late" not in why:
@@ -78,7 +78,7 @@ def test_it_goes_on_where_it_was_and_ends_by_ctrl_c(begun, tmp_path):
     assert "stopped; saved, go on with the same command" in err
     summary = json.loads((folder / "live" / "summary.json").read_text())
     assert summary["steps"] == len(rows.read_text().splitlines()) - 1 > 515
-    assert summary["counts"]["recording"] == 201
+    assert summary["counts"]["recording"] < 300  # of the first run alone
     times = [float(line.split(",")[1]) for line in rows.read_text().splitlines()[1:]]
     assert np.all(np.diff(times) > 0)
 

@@ -1,18 +1,19 @@
 """What acts and learns in a real-time loop: pure functions of parts of one state, jitted.
 
 From nothing r passes through while a record is made; then the static inverse of that record acts, and then what was
-learned on top of it. `jaxouter.deploy.realtime` is the loop in time.
+learned on top of it. A trained policy acts as it is, and then what was learned since. `jaxouter.deploy.realtime` is the
+loop in time.
 
 Once the response of y to a change of r~ is known, each live step is lived again by others: what y would have been under
 their own r~, and what they learn from it, cost the plant nothing (`jaxouter.loop.counterfactual`). Three of them tell
-what r passed through, the static inverse, and what was learned would have been worth; the rest explore.
+what r passed through, the policy kept from the beginning, and what was learned would have been worth; the rest explore.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import chex
 import jax
@@ -36,13 +37,14 @@ from jaxouter.training.config import DEFAULT, TrainConfig
 from jaxouter.training.policy import LearnedPolicy
 from jaxouter.training.trainer import FIELDS, Trainer, TrainState
 
-Stage = Literal["recording", "static", "learned"]
+Kept = Literal["static", "trained"]
+Stage = Literal["recording", "learned"] | Kept
 Why = Stage | Reason
-WHYS: tuple[Why, ...] = (*get_args(Stage), "late", "missing", "not finite", "out of range")
+WHYS: tuple[Why, ...] = ("recording", "static", "trained", "learned", "late", "missing", "not finite", "out of range")
 NAME = "live"
 FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y comes to r~ at once
 HISTORY = 8  # where nothing else is known
-COMPARED = 3  # of the others: r passes through; the static inverse; what was learned, without exploration
+COMPARED = 3  # of the others: r passes through; the policy that was kept; what was learned, without exploration
 EXPLORING = 12  # of the others
 REDRAW = 0.02  # probability that one of these gets another set-point at a step
 KEPT = 20_000  # control steps in the replay
@@ -82,7 +84,9 @@ class LiveState(NamedTuple):
     learner: LearnerState
     replay: ReplayState
     prior: AffineParams  # r~ of a zero action
+    kept: Any  # actor from the beginning, to fall back on; of zeros it is the static inverse
     begun: jax.Array  # bool, whether the prior is more than r~ = r
+    leads: jax.Array  # bool, whether what was learned acts
     response: Response
     sample: Sample  # the last one
     others: Others
@@ -97,22 +101,24 @@ class Live:
 
     trainer: Trainer  # of environments that nobody steps: the loop itself, and the others
     takeover: int
-    """Updates before what was learned acts; 0: from the beginning."""
+    """Updates before what was learned acts."""
+    kept: Kept
+    """What acts before it."""
 
     @classmethod
-    def of(cls, config: TrainConfig, env: Environment, takeover: int, critic_alone: int) -> Live:
+    def of(cls, config: TrainConfig, env: Environment, takeover: int, kept: Kept) -> Live:
         """For the configuration and the environment of a run, or of `declared`.
 
         Args:
             config, env: learner, exploration and observation. The loop itself has the least exploration.
-            takeover: updates before what was learned acts.
-            critic_alone: updates before the actor moves.
+            takeover: updates before what was learned acts; half of them are of the critic alone.
+            kept: what acts before it.
         """
-        ddpg = replace(config.ddpg, n_step=1, rate_decay="constant", actor_from=critic_alone)
+        ddpg = replace(config.ddpg, n_step=1, rate_decay="constant", actor_from=takeover // 2)
         config = replace(config, environments=1 + COMPARED + EXPLORING, ddpg=ddpg)
         policy = LearnedPolicy(env.observer, DDPG(ddpg, env.observer.size))
         replay = Replay(FIELDS, config.environments, KEPT, env.observer.history)
-        return cls(Trainer(config, env, policy, replay), takeover)
+        return cls(Trainer(config, env, policy, replay), takeover, kept)
 
     @property
     def observer(self) -> Observer:
@@ -124,12 +130,14 @@ class Live:
         """Nothing is known: r~ = r."""
         key, key_learner = jax.random.split(key)
         zero, middle = jnp.zeros(()), jnp.asarray(self.observer.y_middle, float)
-        sample = self.first(middle, middle)
+        sample, learner = self.first(middle, middle), self.trainer.learner.init(key_learner)
         return LiveState(
-            learner=self.trainer.learner.init(key_learner),
+            learner=learner,
             replay=self.trainer.replay.init(),
             prior=AffineParams(jnp.ones(()), zero),
+            kept=jax.tree.map(jnp.zeros_like, learner.actor),
             begun=jnp.zeros((), bool),
+            leads=jnp.zeros((), bool),
             response=Response(jnp.zeros(self.observer.history), jnp.zeros(self.observer.history)),
             sample=sample,
             others=self.gathered(sample),
@@ -142,15 +150,15 @@ class Live:
         """Begin with what a run has learned; its optimisers and targets begin anew."""
         fresh = self.fresh(key)
         actor, critics = state.learner.actor, state.learner.critics
-        copies = jax.tree.map(jnp.copy, (actor, critics))  # the learner is donated, and no buffer twice
-        learner = fresh.learner._replace(actor=actor, critics=critics, target_actor=copies[0], target_critics=copies[1])
-        return fresh._replace(learner=learner, prior=state.prior, begun=jnp.ones((), bool))
+        targets = jax.tree.map(jnp.copy, (actor, critics))  # the learner is donated, and no buffer twice
+        learner = fresh.learner._replace(actor=actor, critics=critics)
+        learner = learner._replace(target_actor=targets[0], target_critics=targets[1])
+        kept = jax.tree.map(jnp.copy, actor)
+        return fresh._replace(learner=learner, kept=kept, prior=state.prior, begun=jnp.ones((), bool))
 
     def stage(self, state: LiveState) -> Stage:
         """What decides where nothing is wrong."""
-        if not state.begun:
-            return "recording"
-        return "learned" if int(state.learner.updates) >= self.takeover else "static"
+        return "learned" if state.leads else self.kept if state.begun else "recording"
 
     @partial(jax.jit, static_argnums=0)
     def first(self, r: jax.Array, y: jax.Array) -> Sample:
@@ -168,13 +176,13 @@ class Live:
 
     @partial(jax.jit, static_argnums=0)
     def act(
-        self, actor: Any, prior: AffineParams, before: Sample, explore: jax.Array, r: jax.Array, y: jax.Array
+        self, actors: tuple[Any, Any], prior: AffineParams, before: Sample, explore: Any, r: jax.Array, y: jax.Array
     ) -> tuple[Memory, jax.Array]:
-        """At t_k: the memory, and r~ of the static inverse and of the policy, both with exploration; (2,)."""
+        """At t_k: the memory, and r~ of both actors, the kept and the learned one, with exploration; (2,)."""
         memory = self.observer.record(before.memory, before.y, before.r_tilde)
         memory, obs = self.observer.observe(memory, r, y)
-        learned = self.trainer.learner.act(actor, obs)[0]
-        actions = jnp.clip(jnp.stack([jnp.zeros_like(learned), learned]) + explore, -1.0, 1.0)
+        actions = jnp.concatenate([self.trainer.learner.act(actor, obs) for actor in actors])
+        actions = jnp.clip(actions + explore, -1.0, 1.0)
         return memory, jax.vmap(self.trainer.policy.r_tilde, (None, None, 0))(prior, r, actions)
 
     @partial(jax.jit, static_argnums=0)
@@ -208,7 +216,8 @@ class Live:
         explore = noise.ornstein_uhlenbeck(before_noise, normal, config.noise_theta, sigma)
         other_noise = jnp.concatenate([jnp.zeros(COMPARED), explore[1:]])
 
-        memory, r_tilde = jax.vmap(self.act, (None, None, 0, 0, 0, 0))(actor, state.prior, before, other_noise, r, y)
+        actors = state.kept, actor
+        memory, r_tilde = jax.vmap(self.act, (None, None, 0, 0, 0, 0))(actors, state.prior, before, other_noise, r, y)
         passed = jnp.clip(now.r, *self.observer.r_tilde_bounds)
         r_tilde = r_tilde[:, 1].at[:2].set(jnp.stack([passed, r_tilde[1, 0]]))
         dr_tilde = jnp.column_stack([r_tilde - now.r_tilde, others.dr_tilde[:, :-1]])
@@ -309,7 +318,8 @@ def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[Trai
         ValueError: the ranges are none.
     """
     said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
-    plant, _ = arx.make(FOLLOWS, [FOLLOWS], name=NAME, time_unit="s", history=HISTORY, **said)
+    said |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # each move of r~ has its price
+    plant, _ = arx.make(FOLLOWS, [FOLLOWS], **said)
     observer = Observer.of(plant)
     ddpg = replace(DEFAULT.ddpg, hidden=(64, 64), batch_size=128, discount=0.95)  # an update fits into milliseconds
     config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale, ddpg=ddpg)

@@ -27,7 +27,7 @@ from jaxouter.training.run import Run, open_run, write_json
 FORMAT = 1
 EPISODES = 64  # of a family of references, after which they come again
 PARTS = {"first quarter": slice(0, 1), "last quarter": slice(3, 4)}  # of four
-SIGNALS = ("y", "y_passed", "y_static", "y_learned")
+SIGNALS = ("y", "y_passed", "y_kept", "y_learned")
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,11 @@ class Declaration:
     episode_steps: int = 400
     """Control steps of a reference."""
     takeover: int = 2_000
-    """Updates before what is learned acts; of a trained run before its actor moves."""
+    """Updates before what is learned may act."""
     r_tilde_bounds: tuple[float, float] | None = None
+    """From nothing: least and greatest r~ that the loop may be shown."""
     setpoint_range: tuple[float, float] | None = None
+    """From nothing: between what r lies, as a rule; scales what is seen, and random references."""
 
     def check(self) -> None:
         """Raises ValueError, naming option, value and what is allowed."""
@@ -93,11 +95,11 @@ class LiveFolder:
         if self.trained:
             run, seed, _ = open_run(self.run)
             trainer, _ = run.trainer
-            live = Live.of(trainer.config, trainer.env, 0, said.takeover)
+            live = Live.of(trainer.config, trainer.env, said.takeover, "trained")
             state = live.trained(key, run.load(seed)[0])
         else:
             options = PlantOptions(r_tilde_bounds=said.r_tilde_bounds, setpoint_range=said.setpoint_range)
-            live = Live.of(*declared(said.dt, said.episode_steps, options), said.takeover, said.takeover // 2)
+            live = Live.of(*declared(said.dt, said.episode_steps, options), said.takeover, "static")
             state = live.fresh(key)
         return live, checkpoint.load(self.state_file, state)[0] if self.state_file.exists() else state
 
@@ -142,7 +144,7 @@ class LiveFolder:
         }
 
     def save(self, loop: Loop) -> None:
-        """State and controller.
+        """State, and the controller that acts.
 
         Raises:
             OSError: they can't be written; what was there is whole.
@@ -151,7 +153,8 @@ class LiveFolder:
         checkpoint.save(self.state_file, state)
         if state.begun:
             trainer = loop.live.trainer
-            law = Law.of(trainer.policy, LearnedParams(state.learner.actor, state.prior), trainer.env.plant)
+            actor = state.learner.actor if state.leads else state.kept
+            law = Law.of(trainer.policy, LearnedParams(actor, state.prior), trainer.env.plant)
             law.save(self.path / "controller.npz")
 
 

@@ -22,7 +22,8 @@ RESERVE = 0.1  # of a period, which updates leave alone
 FORGET = 0.9  # of what an update was last seen to take at most
 NAP = 0.2  # s, longest sleep before looking whether to stop
 LATELY = 200  # control steps, time constant of the mean errors that are compared
-BETTER = 0.9  # errors as large as those of the static inverse let what was learned take over
+CAME, KEPT, LEARNED = 0, 2, 3  # of the errors
+BETTER = 0.9  # errors as large as those of the policy that was kept let what was learned take over
 WORSE, SLACK = 1.25, 0.02  # as large, and so much of half the set-point range more: they send it back
 
 
@@ -38,7 +39,7 @@ class Settings:
     """Period, s."""
     learn: bool = False
     record: int = 500
-    """Control steps with r~ = r before the static inverse is identified."""
+    """Control steps before the response is identified, and the static inverse."""
     most_updates: int = 8
     """Updates a period, at most."""
     transfer_steps: int = 10
@@ -55,7 +56,7 @@ class Row(NamedTuple):
     r_tilde: float
     why: Why
     y_passed: float | None  # y, had r passed all the time, as far as the record tells
-    y_static: float | None  # y, had the static inverse acted
+    y_kept: float | None  # y, had the static inverse acted, or the trained policy as it was
     y_learned: float | None  # y, had what is learned so far acted
 
 
@@ -66,8 +67,9 @@ class Loop:
     passes for that step; what was learned takes over with the next one. The grid of periods is kept: what came too late
     for a whole period is skipped.
 
-    What was learned takes over where |r - y| would have been less than that of the static inverse lately, as far as the
-    record tells that. Where it turns out worse, the static inverse is back, for as many updates as in the beginning.
+    What was learned takes over where |r - y| would have been less than under the policy that was kept lately, as far as
+    the record tells that. Where it turns out worse, the one that was kept is back, for as many updates as in the
+    beginning.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class Loop:
         """
         self.live, self.settings = live, settings
         self.act_seconds = array("f")
-        self.sent_back = 0  # times that what was learned was worse than the static inverse
+        self.sent_back = 0  # times that what was learned turned out worse
         self.trouble: str | None = None  # why there is no static inverse yet
         self._state = state if settings.learn else state._replace(noise=jnp.zeros_like(state.noise))
         self._plant, self._reference, self._clock = plant, reference, clock
@@ -114,7 +116,6 @@ class Loop:
         self._takeover_at = live.takeover
         self._known = bool(np.any(state.response.b))
         self._errors = np.zeros(4)  # lately, of what came and of the others that are compared
-        self._y_others = np.zeros(3)
         self._compile()
         self._fastest = self._longest = self._update_takes() if settings.learn else 0.0
         self._begin, self._period = begin, 0
@@ -172,9 +173,10 @@ class Loop:
         if not self._met:
             before = self.live.first(r_seen, y_seen)
             self._met = fault is None
-        known = self._state.learner.actor, self._state.prior, before, self._state.noise
-        memory, offered = self.live.act(*known, r_seen, y_seen)
-        wanted = {"recording": r} | dict(zip(("static", "learned"), np.asarray(offered).tolist(), strict=True))
+        actors = self._state.kept, self._state.learner.actor
+        memory, offered = self.live.act(actors, self._state.prior, before, self._state.noise, r_seen, y_seen)
+        kept, learned = np.asarray(offered).tolist()
+        wanted = {"recording": r, self.live.kept: kept, "learned": learned}
         self._period += 1
         if self.left < 0.0 or (skipped and self._unbroken):
             fault = "late"
@@ -203,12 +205,9 @@ class Loop:
             self._state = self._state._replace(learner=jax.block_until_ready(learner))
             self._updates += 1
             self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
-        if (
-            self._stage == "static"
-            and self._updates >= self._takeover_at
-            and self._errors[3] < BETTER * self._errors[2]
-        ):
-            self._errors[0] = self._errors[2]
+        better = self._errors[LEARNED] < BETTER * self._errors[KEPT]
+        if self._stage == self.live.kept and self._updates >= self._takeover_at and better:
+            self._errors[CAME] = self._errors[KEPT]
             self._enter("learned")
 
     def _measured(self) -> float | None:
@@ -238,6 +237,7 @@ class Loop:
 
     def _enter(self, stage: Stage) -> None:
         self._stage, self._transfer = stage, self._from_here()
+        self._state = self._state._replace(leads=jax.device_put(np.bool_(stage == "learned")))
 
     def _note(self, before: Sample, memory: Any, r: Any, y: Any, fine: bool) -> Sequence[float | None]:
         """The step becomes past, and what came of the one before is kept; y of the others."""
@@ -264,13 +264,13 @@ class Loop:
         return found.tolist()
 
     def _compare(self, r: float, y: np.ndarray) -> None:
-        """Send what was learned back where it has been worse than the static inverse."""
+        """Send what was learned back where it has been worse than what was kept."""
         self._errors += (np.abs(r - y) - self._errors) / LATELY
-        came, _, static, _ = self._errors
-        if self._stage == "learned" and came > WORSE * static + SLACK * self.live.observer.y_scale:
+        bound = WORSE * self._errors[KEPT] + SLACK * self.live.observer.y_scale
+        if self._stage == "learned" and self._errors[CAME] > bound:
             self.sent_back += 1
             self._takeover_at = self._updates + self.live.takeover
-            self._enter("static")
+            self._enter(self.live.kept)
 
     def _identify(self) -> None:
         """The response, and where r has passed so far the static inverse."""
@@ -285,14 +285,14 @@ class Loop:
         if self._stage == "recording":
             replay = self.live.relabelled(self._state.replay, prior)
             self._state = self._state._replace(replay=replay, prior=prior, begun=jax.device_put(np.True_))
-            self._enter("static")
+            self._enter(self.live.kept)
 
     def _compile(self) -> None:
         """On copies: what learns gives its buffers away."""
         live, state = self.live, self._state
         r = y = self._float(live.observer.y_middle)
         sample = live.first(r, y)
-        live.act(state.learner.actor, state.prior, sample, state.noise, r, y)
+        live.act((state.kept, state.learner.actor), state.prior, sample, state.noise, r, y)
         rest = state._replace(learner=None, replay=None)
         rows = live.relive(rest, state.learner.actor, sample, np.uint32(0))[2]
         live.gathered(sample)

@@ -58,7 +58,7 @@ class Lag:
 def tiny(takeover: int = 100) -> Live:
     config, env = declared(DT, 100, OPTIONS)
     config = replace(config, ddpg=replace(config.ddpg, hidden=(16, 16), batch_size=32))
-    return Live.of(config, env, takeover, takeover // 2)
+    return Live.of(config, env, takeover, "static")
 
 
 def staircase(seed: int = 0) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_r_passes_then_the_static_inverse_acts_then_what_was_learned_on_it(learn
 def test_the_others_are_what_the_plant_would_have_done(learned):
     _, rows = learned
     r = np.array([row.r for row in rows])
-    for name, r_tilde in (("y_passed", r), ("y_static", np.clip((r - 1) / 0.7, 0, 10))):
+    for name, r_tilde in (("y_passed", r), ("y_kept", np.clip((r - 1) / 0.7, 0, 10))):
         plant = Lag()
         truth = np.array([plant(value) for value in [r[0], *r_tilde[:-1]]])
         told = np.array([math.nan if getattr(row, name) is None else getattr(row, name) for row in rows])
@@ -128,10 +128,10 @@ def test_the_replay_holds_what_happened(learned):
 
 
 def test_it_learns_to_be_better_than_both(learned):
-    loop, rows = ran(Live.of(*declared(DT, 200, OPTIONS), 500, 250), 1600, learn=True, record=300, most_updates=4)
+    loop, rows = ran(Live.of(*declared(DT, 200, OPTIONS), 500, "static"), 1600, learn=True, record=300, most_updates=4)
     assert loop.stage == "learned"
     r, y, static, passed = (
-        np.array([getattr(row, name) for row in rows[-500:]]) for name in ("r", "y", "y_static", "y_passed")
+        np.array([getattr(row, name) for row in rows[-500:]]) for name in ("r", "y", "y_kept", "y_passed")
     )
     came, of_static, of_passed = (np.abs(r[:-1] - each[1:]).mean() for each in (y, static, passed))
     assert came < 0.9 * of_static < 0.9 * of_passed
@@ -194,9 +194,8 @@ def test_what_turns_out_worse_is_sent_back(learned):
     loop, _ = learned
     state = loop.state
     bad = jax.tree.map(lambda leaf: 5.0 * leaf + 1.0, state.learner.actor)
-    live = replace(loop.live, takeover=10)
-    state = state._replace(learner=state.learner._replace(actor=bad, updates=jnp.asarray(10, jnp.int32)))
-    again, rows = ran(live, 300, state=state)
+    state = state._replace(learner=state.learner._replace(actor=bad), leads=jnp.ones((), bool))
+    again, rows = ran(loop.live, 300, state=state)
     whys = [row.why for row in rows]
     assert whys[0] == "learned"
     assert whys[-1] == "static"
@@ -213,7 +212,7 @@ def test_a_record_that_tells_nothing_leaves_r_as_it_is():
 def test_a_trained_policy_acts_as_it_is():
     trainer, params = build(small("heaters"))
     trained = trainer.fresh(jax.random.key(3), params)
-    live = Live.of(trainer.config, trainer.env, 0, 100)
+    live = Live.of(trainer.config, trainer.env, 100, "trained")
     state = live.trained(jax.random.key(0), trained)
     r = np.linspace(*trainer.env.plant.setpoint_range, 40)
     clock, rows = Clock(), []
@@ -225,6 +224,7 @@ def test_a_trained_policy_acts_as_it_is():
     for row in rows:
         carry, r_tilde = act(known, carry, *jnp.asarray([row.r, row.y], float))
         assert row.r_tilde == pytest.approx(float(r_tilde), abs=1e-4)
+    assert {row.why for row in rows} == {"trained"}
     assert loop.updates == 0
 
 
