@@ -124,7 +124,9 @@ def test_the_replay_holds_what_happened(learned):
     np.testing.assert_allclose(
         offset + slope * kept["r"] + 5.0 * kept["action"], kept["r_tilde"], atol=1e-4
     )  # also of what was recorded
-    np.testing.assert_allclose(kept["reward"], -0.3 * np.abs(kept["r"] - kept["y_next"]) / 2, atol=1e-5)
+    moves = np.abs(np.diff(kept["r_tilde"])), np.abs(kept["y_next"] - kept["y"])[1:]
+    price = 0.3 * np.abs(kept["r"] - kept["y_next"])[1:] + 0.1 * moves[0] + 0.1 * moves[1]
+    np.testing.assert_allclose(kept["reward"][1:], -price / 2, atol=1e-5)
 
 
 def test_it_learns_to_be_better_than_both(learned):
