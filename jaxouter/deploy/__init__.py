@@ -1,4 +1,4 @@
-"""Where outer loops go: the controller, with NumPy alone, and adapters to other tools, each with its extra."""
+"""Where outer loops go: the controller, with NumPy alone; exports, the live loop, and adapters, with their extras."""
 
 from jaxouter.deploy.controller import Controller
 

@@ -1,1 +1,1 @@
-"""Evaluation: scenarios, roll-outs, figures of merit, figures."""
+"""Evaluation: scenarios that training never sees, roll-outs, figures of merit, rivals, sweeps, certificate, report."""

@@ -1,1 +1,1 @@
-"""Training: configuration, the jitted pipeline, checkpoints, run folders."""
+"""Training: configuration and presets, pretraining, the jitted pipeline, checkpoints, run folders."""
