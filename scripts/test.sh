@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Lint, types and tests, those of plants and loop in double precision too; under 12 minutes on 2 cores. With --all, under
-# 90 minutes, also the slow tests, all others in double precision with checks for NaN, places broken on purpose, 20
-# kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time, see
-# peers.sh); what came out is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested
-# then.
+# Lint, types and tests, those of plants and loop in double precision too; under 12 minutes on 2 cores.
+# --all, under 90 minutes: also the slow tests, all others in double precision with checks for NaN, places broken on
+# purpose, 20 kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time,
+# see peers.sh). --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time
+# is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile "$@"; }
@@ -11,11 +11,16 @@ in_double() { JAX_ENABLE_X64=1 tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
 documentation() { NO_MKDOCS_2_WARNING=1 "$PYTHON" -m mkdocs build --strict --quiet && "$PYTHON" scripts/docs.py; }
-part() {  # TITLE COMMAND...: run it, and note its last line and its minutes
+commit=$(git rev-parse --short HEAD)$(git diff --quiet HEAD -- . ':!benchmarks/results' || echo -dirty)
+result=benchmarks/results/tests.md failed=0
+part() {  # TITLE COMMAND...: run it, and note its last line, minutes, commit and date in place of those before
     local title=$1 begin=$SECONDS last
     shift
-    last=$("$@" | tee /dev/stderr | tail -n 1 | tr -d '=' | xargs) || failed=1
-    printf '| %s | %s | %d |\n' "$title" "$last" $(((SECONDS - begin + 59) / 60)) >>"$result"
+    [[ $title == *$only* ]] || return 0
+    last=$("$@" | tee >(cat >&2) | tail -n 1 | tr -d '=' | xargs) || failed=1
+    sed -i "/^| $title |/d" "$result"
+    printf '| %s | %s | %d | %s | %s |\n' "$title" "$last" $(((SECONDS - begin + 59) / 60)) \
+        "$commit" "$(date --utc +%F)" >>"$result"
 }
 
 "$PYTHON" -m ruff format --check .
@@ -24,11 +29,12 @@ part() {  # TITLE COMMAND...: run it, and note its last line and its minutes
 if [ $# -eq 0 ]; then
     tests
     in_double tests/plants tests/loop
-elif [ "$*" = --all ]; then
-    failed=0 result=benchmarks/results/tests.md
-    printf '`scripts/test.sh --all`, %s, %s CPUs, commit %s\n\n| part | last line | minutes |\n|---|---|---|\n' \
-        "$(date --utc +%F)" "$(nproc)" "$(git describe --always --dirty)" >"$result"
-    part "all tests, the slow ones too" tests --all
+elif [ "$1" = --all ]; then
+    only=${*:2}
+    [ -e "$result" ] ||
+        printf '`scripts/test.sh --all`, %s CPUs\n\n| part | last line | minutes | commit | date |\n|---|---|---|---|---|\n' \
+            "$(nproc)" >"$result"
+    part "all tests, the slow ones too" tests --all --no-loadscope-reorder
     part "plants and loop, double precision" in_double --all tests/plants tests/loop
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" "$PYTHON" scripts/mutants.py

@@ -37,9 +37,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--all"):
-        return
     slow = [item for item in items if item.get_closest_marker("slow")]
-    if slow:
+    if config.getoption("--all"):  # the slowest files first, so that no process is left with one of them at the end
+        files = {item.path for item in slow}
+        items.sort(key=lambda item: item.path not in files)
+    elif slow:
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if item not in slow]
