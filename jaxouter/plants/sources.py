@@ -112,7 +112,7 @@ def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tup
         return name, _named(name, attribute(Path(file), name, "a plant of your own")), Path(file)
     offered = list(entry_points(group=GROUP, name=reference))
     if not offered:
-        known = [*plants.REGISTRY, *(point.name for point in entry_points(group=GROUP))]
+        known = dict.fromkeys([*plants.REGISTRY, *(point.name for point in entry_points(group=GROUP))])
         raise ValueError(f"there is no plant {reference!r}; the plants are: {', '.join(known)}, and {FORMS}")
     make = offered[0].load()
     return reference, _named(reference, make), Path(inspect.getsourcefile(make) or "")

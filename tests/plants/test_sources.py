@@ -3,6 +3,7 @@
 import json
 from unittest.mock import patch
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -76,6 +77,19 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, line, text):
     assert text in str(error.value)
 
 
+def test_an_installed_package_offers_a_plant(tmp_path, monkeypatch):
+    site = tmp_path / "site-packages"
+    (site / "basin-1.0.dist-info").mkdir(parents=True)
+    (site / "basin-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: basin\nVersion: 1.0\n")
+    (site / "basin-1.0.dist-info" / "entry_points.txt").write_text("[jaxouter.plants]\nBasin = basin:Tanks\n")
+    (site / "basin.py").write_text((ROOT / "scripts" / "examples" / "tanks.py").read_text())
+    monkeypatch.syspath_prepend(site)
+    assert sources.add("Basin") == "Basin"
+    assert plants.make("Basin")[0].name == "Basin"
+    with pytest.raises(ValueError, match=r"the plants are: pitch, heaters, Basin, and FILE\.py:NAME"):
+        sources.add("basin")
+
+
 def test_a_broken_contract_names_the_function(tmp_path):
     source = (ROOT / "scripts" / "examples" / "tanks.py").read_text()
     for broken, text in (
@@ -137,3 +151,34 @@ def test_a_gymnasium_environment_is_a_plant():
         sources.add("gym:jaxouter/Heaters-v0", PlantOptions(y_index=99))
     with pytest.raises(ValueError, match="gym:No-v9"):
         sources.add("gym:No-v9")
+
+
+class LagEnvironment(gymnasium.Env):
+    """The lag as Gymnasium knows it; y is the second number that it shows."""
+
+    dt = 0.1
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+
+    def __init__(self):
+        self.lag = Lag()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([0.0, self.lag.reset(seed)], np.float32), {}
+
+    def step(self, action):
+        return np.array([0.0, self.lag.step(action.item())], np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.slow
+def test_a_gymnasium_environment_is_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(
+        gymnasium.registry, "Lag-v0", gymnasium.envs.registration.EnvSpec("Lag-v0", entry_point=LagEnvironment)
+    )
+    asked = ["gym:Lag-v0", "--y-index", "1", "--setpoint-range", "-0.5", "0.5", "--episode-steps", "30"]
+    train.main([*asked, "--out", "run", *TINY])
+    assert "Lag-v0/steps" in capsys.readouterr().out
+    kept = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (kept["plant"]["reference"], kept["config"]["plant_options"]["y_index"]) == ("gym:Lag-v0", 1)
