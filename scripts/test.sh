@@ -6,7 +6,7 @@
 # is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
-tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile "$@"; }
+tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder "$@"; }
 in_double() { JAX_ENABLE_X64=1 tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
@@ -34,7 +34,7 @@ elif [ "$1" = --all ]; then
     [ -e "$result" ] ||
         printf '`scripts/test.sh --all`, %s CPUs\n\n| part | last line | minutes | commit | date |\n|---|---|---|---|---|\n' \
             "$(nproc)" >"$result"
-    part "all tests, the slow ones too" tests --all --no-loadscope-reorder
+    part "all tests, the slow ones too" tests --all
     part "plants and loop, double precision" in_double --all tests/plants tests/loop
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" "$PYTHON" scripts/mutants.py

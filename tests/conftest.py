@@ -17,6 +17,9 @@ jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# They come first, so that no process is left with one of them while the others have nothing more to do.
+LONGEST = ("test_presets", "test_faults", "test_devices", "test_trainer", "test_pretraining", "test_commands")
+
 
 @pytest.fixture(scope="session", autouse=True)
 def results_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -37,10 +40,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
     slow = [item for item in items if item.get_closest_marker("slow")]
-    if config.getoption("--all"):  # the slowest files first, so that no process is left with one of them at the end
-        files = {item.path for item in slow}
-        items.sort(key=lambda item: item.path not in files)
-    elif slow:
+    if slow and not config.getoption("--all"):
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if item not in slow]

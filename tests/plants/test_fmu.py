@@ -68,6 +68,7 @@ def trained(arguments, name, capsys):
     return Run.open(Path("run")).config
 
 
+@pytest.mark.slow
 def test_an_exported_controller_is_a_plant(controller, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     options = ["--input", "r", "--output", "r_tilde", "--r-tilde-bounds", "-10", "10", *FEW]
@@ -111,6 +112,7 @@ def test_an_fmu_of_fmi_3_says_what_it_is_and_answers_as_its_equation_does(lag):
         np.testing.assert_allclose(y, response(r_tilde, 0.1 * np.arange(1, 51)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_fmu_of_fmi_3_is_trained_on_and_checked(lag, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     check.main([f"fmu:{lag}", *FEW])
