@@ -20,6 +20,7 @@ from jaxouter.loop.log import Log
 from jaxouter.plants.simulators import PlantOptions
 from tests import lag
 from tests.logs import recorded, write
+from tests.precision import of_single_draws
 
 KEY = jax.random.key(0)
 
@@ -172,6 +173,7 @@ def test_too_few_members_are_refused(clean: Log) -> None:
         logs.ensemble(clean, members=1)
 
 
+@of_single_draws  # of other draws the models may agree by chance
 def test_an_output_that_has_nothing_to_do_with_r_tilde_is_refused(tmp_path: Path, clean: Log) -> None:
     noise = clean._replace(y=np.random.default_rng(0).standard_normal(600))
     file = write(tmp_path / "noise.csv", noise)

@@ -17,9 +17,8 @@ from jaxouter.deploy import c
 from jaxouter.plants import contract, simulate, sources
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.run import Run
-from tests.training.small import small
+from tests.training.small import TINY, small
 
-TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]
 FEW = ["--episode-steps", "30"]
 K, T, D = 0.5, 0.3, 0.25  # of lag_fmi3.c
 

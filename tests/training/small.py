@@ -4,6 +4,8 @@ from dataclasses import replace
 
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 
+TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]  # of the command
+
 
 def small(plant: str = "heaters", name: str = "default", **changes) -> TrainConfig:
     """8 environments, tiny networks, 3 epochs of which the last is shorter; episodes end within it."""

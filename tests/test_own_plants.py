@@ -1,0 +1,78 @@
+"""Plants of one's own through the commands: in a file, in a log, in Gymnasium."""
+
+import json
+from unittest.mock import patch
+
+import gymnasium
+import numpy as np
+import pytest
+
+from jaxouter import evaluate, plants, train
+from jaxouter.plants import sources
+from jaxouter.training.run import Run
+from tests import lag
+from tests.load import ROOT
+from tests.logs import recorded, write
+from tests.training.small import TINY
+
+TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    """No plant that a test adds stays."""
+    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+        yield
+
+
+def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    train.main([TANKS, "--out", "run", *TINY])
+    assert "Tanks/steps" in capsys.readouterr().out
+    kept = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (kept["config"]["plant"], kept["plant"]["reference"]) == ("Tanks", TANKS)
+    evaluate.main(["run", "--plant", TANKS, "--scenario", "Tanks/steps", "--episodes", "2"])
+    del plants.REGISTRY["Tanks"], sources.SOURCES["Tanks"]
+    with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
+        Run.open(tmp_path / "run")
+
+
+def test_a_log_is_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "lag.csv", recorded(*lag.make(), rows=600, noise=0.03))
+    train.main(["log:lag.csv", "--y-unit", "cm", "--out", "run", *TINY])
+    assert "MAE in cm" in capsys.readouterr().out
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["config"]["plant"] == "lag"
+    with pytest.raises(SystemExit):
+        train.main(["log:none.csv"])
+    assert "there is no file none.csv" in capsys.readouterr().err
+
+
+class LagEnvironment(gymnasium.Env):
+    """A lag; y is the second number that it shows."""
+
+    dt = 0.1
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.y = self.np_random.uniform(-1.0, 1.0)
+        return np.array([0.0, self.y], np.float32), {}
+
+    def step(self, action):
+        self.y += 0.1 * (0.5 * action.item() - self.y)
+        return np.array([0.0, self.y], np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.slow
+def test_a_gymnasium_environment_is_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(
+        gymnasium.registry, "Lag-v0", gymnasium.envs.registration.EnvSpec("Lag-v0", entry_point=LagEnvironment)
+    )
+    asked = ["gym:Lag-v0", "--y-index", "1", "--setpoint-range", "-0.5", "0.5", "--episode-steps", "30"]
+    train.main([*asked, "--out", "run", *TINY])
+    assert "Lag-v0/steps" in capsys.readouterr().out
+    kept = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (kept["plant"]["reference"], kept["config"]["plant_options"]["y_index"]) == ("gym:Lag-v0", 1)
