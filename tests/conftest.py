@@ -17,8 +17,7 @@ jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# They come first, so that no process is left with one of them while the others have nothing more to do.
-LONGEST = ("test_presets", "test_faults", "test_devices", "test_trainer", "test_pretraining", "test_commands")
+LONGEST = ("test_faults", "test_devices", "test_trainer", "test_pretraining", "test_commands", "test_compare")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -40,8 +39,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+    items.sort(key=_place)
     slow = [item for item in items if item.get_closest_marker("slow")]
     if slow and not config.getoption("--all"):
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if item not in slow]
+
+
+def _place(item: pytest.Item) -> int:
+    """Long files early, so that no process is left with one at the end; after those that compile what they need too."""
+    if item.path.stem == "test_presets":
+        return 0
+    if item.path.parent.name in ("plants", "loop", "agents"):
+        return 1
+    return 2 if item.path.stem in LONGEST else 3

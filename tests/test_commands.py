@@ -232,6 +232,7 @@ def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
     assert run.load(0)[1] == done
 
 
+@pytest.mark.slow
 def test_metrics_are_tensorboard_events_too(trained):
     """Also those of rows that were there before; of each value the row's, once."""
     _, folder = trained
@@ -261,6 +262,7 @@ def test_resume_of_a_finished_run_only_shows_it_again(trained, capsys):
     assert (folder / "seed-3" / "metrics.jsonl").read_text() == before
 
 
+@pytest.mark.slow
 def test_third_plant_goes_through_the_whole_of_training(tmp_path, monkeypatch, capsys):
     """Registered by one line, the lag with a delay is learned, and beats the inner loop and the static prefilter."""
     monkeypatch.setitem(REGISTRY, "lag", lag.make)

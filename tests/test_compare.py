@@ -370,6 +370,7 @@ def test_help_names_every_option(capsys):
         assert option in out
 
 
+@pytest.mark.slow
 def test_evaluate_takes_a_rival_that_is_tuned(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     maes = {}

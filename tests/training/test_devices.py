@@ -28,6 +28,7 @@ OPTIONS += ["--pretraining.gradient-steps", "0"]
 
 
 @of_single_draws
+@pytest.mark.slow
 def test_on_four_forced_devices():
     """The tests in `four_devices.py`, in a process that has them."""
     done = subprocess.run(

@@ -25,6 +25,7 @@ def path(tmp_path: Path) -> Path:
     return write(tmp_path / "lag.csv", recorded(*lag.make(), rows=800, noise=0.03))
 
 
+@pytest.mark.slow
 def test_a_controller_from_a_log_is_better_on_the_true_plant(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plants.REGISTRY, "logged", lambda: log.make("logged", str(path)))
     config = small("logged", pretraining=START, residual=True, steps=0)

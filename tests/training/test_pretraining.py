@@ -51,6 +51,7 @@ def test_the_same_seed_gives_the_same_actor(config):
     )
 
 
+@pytest.mark.slow
 def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
     start = replace(START, episodes=32, plants=8, noise=0.02, load=0.05)
     trainer, params = build(replace(config, randomise=(("K", 0.3, 0.7), ("T", 0.2, 0.4)), pretraining=start))
@@ -62,6 +63,7 @@ def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
     assert reached > 0.8 * alone  # both negative
 
 
+@pytest.mark.slow
 def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config, monkeypatch):
     lengths, learn = [], Teacher.train
     monkeypatch.setattr(
@@ -160,6 +162,7 @@ def test_a_damaged_start_begins_anew(config, tmp_path):
     assert heard == [50, 100]
 
 
+@pytest.mark.slow
 def test_the_actor_waits_until_the_critic_has_learned():
     config = small("lag", prefill=640, steps=640 + 8 * 20)
     trainer, params = build(replace(config, ddpg=replace(config.ddpg, actor_from=10)))

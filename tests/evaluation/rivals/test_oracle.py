@@ -80,6 +80,7 @@ def test_built_policy_is_the_one_that_was_chosen(tuned, school):
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_made_once():
     start = PretrainingConfig(gradient_steps=100, batch_size=16)
     config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), residual=True, steps=0)
