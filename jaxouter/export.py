@@ -32,7 +32,7 @@ class Options:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder (its median seed is exported), or the folder of one seed in it."""
     plant: str | None = None
-    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE; its options are those of the run."""
+    """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; its options are those of the run."""
     format: str | None = None
     """onnx, npz, stablehlo, c or fmu."""
     out: Path | None = None

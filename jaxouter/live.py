@@ -52,7 +52,7 @@ class Options:
     updates: int = 8
     """Most updates a period."""
     plant: str | None = None
-    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE."""
+    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -103,7 +103,7 @@ def check(options: Options) -> Callable[[float], Any]:
     else:
         try:
             found = getattr(importlib.import_module(file), name)
-        except (ImportError, AttributeError, TypeError, ValueError) as error:
+        except Exception as error:  # whatever the module raises
             raise ValueError(f"{options.step} can't be imported: {error}") from None
     if not callable(found):
         raise ValueError(f"{options.step} is {found!r}; it must be a function of r~ that gives y")

@@ -10,6 +10,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
+
 
 def float_leaves(params: Any, state: Any) -> list[jax.Array]:
     """The default of `Plant.variables`: every float leaf of the state."""
@@ -27,9 +29,6 @@ def with_float_leaves(params: Any, state: Any, variables: list[jax.Array]) -> An
 
 def _is_float(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
-MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
 
 
 @dataclass(frozen=True)
