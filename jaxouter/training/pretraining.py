@@ -32,6 +32,7 @@ CLIP = 0.1  # of the gradient's norm; below what is usual, so that a batch in wh
 CHUNK = 50  # gradient steps between two reports
 LAST, COLLAPSED = 5, 2.0  # where these steps' mean reward is so many times the best one, the loop has become unstable
 SHORT = 1 / 3  # of the gradient steps, with episodes no longer than the plant's
+CUT, GROWTH = 0.5, 1.25  # by what the learning rate is multiplied where the loop has become unstable, and where not
 FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 
 
@@ -41,6 +42,7 @@ class Rehearsal(NamedTuple):
     before: Any  # whitened actors and optimiser state, each leaf (1, ...), of one report before
     now: Any  # the same, now
     best: Any  # mean reward
+    trust: Any  # share of the learning rate that the next steps take, at most 1
     done: Any  # int32, gradient steps
 
     @classmethod
@@ -48,7 +50,7 @@ class Rehearsal(NamedTuple):
         """Before the first step, from an actor whose first layer takes the whitened observation."""
         actors = jax.tree.map(lambda leaf: leaf[None], actor)
         carry = actors, jax.vmap(ADAM.init)(actors)
-        return cls(carry, carry, jnp.asarray(-np.inf, float), np.int32(0))
+        return cls(carry, carry, jnp.asarray(-np.inf, float), jnp.ones((), float), np.int32(0))
 
 
 class Whitening(NamedTuple):
@@ -235,7 +237,8 @@ def rehearse(
 
     What is unstable shows late, but can be won only by who holds the rest: where the configuration has episodes longer
     than the plant's, they come last. Gradients through a loop that has become unstable lead nowhere: where that
-    happened, training goes on, with other episodes, from where it was two reports before.
+    happened, training goes on, with other episodes and at half the rate, from where it was two reports before; the rate
+    grows again while that goes well.
 
     Args:
         config, policy, learned, report, begin: as of `pretrain`.
@@ -251,15 +254,16 @@ def rehearse(
     white = schools[0].whitening(prior, plant_params, key_white)
     rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
     while (done := int(at.done)) < config.gradient_steps:
-        chunk, school = rates[done : done + CHUNK], schools[done >= longer]
+        chunk, school = at.trust * rates[done : done + CHUNK], schools[done >= longer]
         carry, reward = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
         reward = np.asarray(reward)[:, 0]
         first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
         best = first if done == longer else max(float(at.best), first)
         then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative
-            at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), then)
+            trust = jnp.minimum(1.0, GROWTH * at.trust)
+            at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), trust, then)
         else:
-            at = Rehearsal(at.before, at.before, jnp.asarray(best, float), then)
+            at = Rehearsal(at.before, at.before, jnp.asarray(best, float), CUT * at.trust, then)
         report(at)
     return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)

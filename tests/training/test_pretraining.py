@@ -10,6 +10,7 @@ import pytest
 from jaxouter import plants
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.loop import counterfactual, identify
+from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.pretraining import ADAM, Teacher, Whitening
 from jaxouter.training.run import Run, RunWarning
@@ -78,6 +79,20 @@ def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config,
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
     assert score(trainer.policy, policy, episodes) > 0.9 * score(*identify.static(plant, of_plant, KEY), episodes)
+
+
+def test_where_the_loop_collapses_training_goes_back_and_on_at_half_the_rate(config, monkeypatch):
+    """At a rate at which it must; where it does not, the share grows again."""
+    trainer, params = build(config)
+    with monkeypatch.context() as greater:
+        greater.setattr(pretraining, "RATE", 100.0)
+        heard = []
+        trainer.start(0, params, heard.append)
+    assert [float(at.trust) for at in heard] == [0.5, 0.25]
+    chex.assert_trees_all_equal(*(x for at in heard for x in (at.before, at.now)))
+    trainer.start(0, params, heard.append, heard[0])
+    assert float(heard[-1].trust) == 0.5 * 1.25
+    chex.assert_trees_all_equal(heard[-1].before, heard[0].now)
 
 
 def test_costs_count_by_their_logarithm_where_asked(config):
