@@ -238,7 +238,7 @@ HEATERS = replace(
     plant="heaters",
     integral_steps=None,
     reward_scale=1.0,
-    pretraining=replace(DEFAULT.pretraining, noise=0.02, load=0.2),
+    pretraining=replace(DEFAULT.pretraining, gradient_steps=2_000, noise=0.02, load=0.2),
     ddpg=replace(DEFAULT.ddpg, discount=0.95),
 )
 ROBUST_PITCH = replace(
