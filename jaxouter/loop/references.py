@@ -94,7 +94,8 @@ def doublets(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Arra
     """Middle, up, down, middle: a quarter to all of the range, each pulse an eighth to a quarter of the time."""
     amplitude, width = jax.random.uniform(key, (2,), float, jnp.array([0.25, 0.125]), jnp.array([1.0, 0.25]))
     sign = jax.random.rademacher(jax.random.fold_in(key, 1), (), float)
-    phase = (jnp.arange(steps, dtype=float) - steps / 8) / (width * steps)  # pulses on [0, 1) and [1, 2)
+    since = jnp.arange(steps, dtype=float) - steps / 8  # without rounding: the same first step on every processor
+    phase = since / (width * steps)  # pulses on [0, 1) and [1, 2)
     pulse = jnp.where((phase >= 0) & (phase < 1), 1.0, 0.0) - jnp.where((phase >= 1) & (phase < 2), 1.0, 0.0)
     return (low + high) / 2 + sign * amplitude * (high - low) / 2 * pulse
 
