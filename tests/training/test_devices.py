@@ -119,6 +119,7 @@ def pair() -> list[list[str]]:
 
 @pytest.mark.timeout(500)
 @of_single_draws
+@pytest.mark.slow
 def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
     """50 updates; the two processes are stopped through the second one, and resumed."""
     train = ["heaters", *OPTIONS, "--devices", "2", "--out"]
