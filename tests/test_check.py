@@ -9,6 +9,7 @@ from jaxouter import check, plants
 from jaxouter.plants import sources
 from tests import lag, logs
 from tests.load import ROOT
+from tests.precision import makes_nan
 
 TANKS = ROOT / "scripts" / "examples" / "tanks.py"
 
@@ -35,6 +36,7 @@ def test_dead_time_and_gain_of_the_lag():
     np.testing.assert_allclose(responses[:, -1] / moves, 0.5, rtol=1e-3)
 
 
+@makes_nan
 def test_what_is_not_pure_is_found_and_ends_with_status_1(tmp_path, capsys):
     source = TANKS.read_text().replace(
         "return state.lower\n", "return jnp.where(state.lower > 15.0, jnp.nan, state.lower)\n"

@@ -258,9 +258,10 @@ class Live:
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def relabelled(self, replay: ReplayState, prior: AffineParams) -> ReplayState:
         """The replay with its actions in terms of another prior."""
-        r, r_tilde, place = (FIELDS.index(name) for name in ("r", "r_tilde", "action"))
-        action = self._action(prior, replay.rows[..., r], replay.rows[..., r_tilde])
-        return replay._replace(rows=replay.rows.at[..., place].set(action.astype(jnp.float32)))
+        rows, places = replay.rows, [FIELDS.index(name) for name in ("r", "r_tilde", "action")]
+        r, r_tilde = (rows[..., place].astype(prior.slope.dtype) for place in places[:2])
+        action = self._action(prior, r, r_tilde).astype(rows.dtype)
+        return replay._replace(rows=rows.at[..., places[2]].set(action))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update(self, learner: LearnerState, replay: ReplayState, key: chex.PRNGKey) -> LearnerState:

@@ -18,6 +18,7 @@ from jaxouter.loop.policy import AffineParams
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.trainer import FIELDS, build
 from tests.load import load
+from tests.precision import of_single_draws
 from tests.training.small import small
 
 DT = 0.02
@@ -129,6 +130,7 @@ def test_the_replay_holds_what_happened(learned):
     np.testing.assert_allclose(kept["reward"][1:], -price / 2, atol=1e-5)
 
 
+@of_single_draws
 def test_it_learns_to_be_better_than_both(learned):
     loop, rows = ran(Live.of(*declared(DT, 200, OPTIONS), 500, "static"), 1600, learn=True, record=300, most_updates=4)
     assert loop.stage == "learned"
