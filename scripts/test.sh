@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Lint, types and tests, those of plants and loop in double precision too; on 2 cores 12 minutes with AVX-512, 17 without.
+# Lint, types and tests, those of plants and loop in double precision too, in under 12 minutes on 2 cores: most of what
+# runs there is small, so XLA is told to compile fast rather than well. All else compiles as it does for users:
 # --all, under 80 minutes: also the slow tests, all others in double precision with checks for NaN, places broken on
 # purpose, 20 kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time,
 # see peers.sh). --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time
@@ -27,6 +28,7 @@ part() {  # TITLE COMMAND...: run it, and note its last line, minutes, commit an
 "$PYTHON" -m ruff check .
 "$PYTHON" -m basedpyright --pythonpath "$PYTHON"
 if [ $# -eq 0 ]; then
+    export XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false ${XLA_FLAGS:-}"
     tests
     in_double tests/plants tests/loop
 elif [ "$1" = --all ]; then
