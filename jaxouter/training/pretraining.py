@@ -9,6 +9,7 @@ little, and the small differences are what tells the state of the plant.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 from jaxouter.loop import counterfactual, identify, rewards
 from jaxouter.loop.policy import AffineParams, Policy
@@ -34,6 +37,7 @@ LAST, COLLAPSED = 5, 2.0  # where these steps' mean reward is so many times the 
 SHORT = 1 / 3  # of the gradient steps, with episodes no longer than the plant's
 CUT, GROWTH = 0.5, 1.25  # by what the learning rate is multiplied where the loop has become unstable, and where not
 FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
+EPISODES = "episodes"  # the axis over which devices share them
 
 
 class Rehearsal(NamedTuple):
@@ -74,11 +78,15 @@ class Teacher:
     """Largest unseen step of r~, at a random time in half of the episodes; 1 is half the range of r~."""
     log_above: float = 0.0
     """Cost a step above which episodes count by its logarithm; 0: all count in full."""
+    devices: int = 1
+    """Of this process, which share the episodes of a gradient step evenly."""
 
     @classmethod
-    def of(cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int) -> Teacher:
-        """The teacher with the disturbances and the cost of a configuration."""
-        return cls(plant, policy, batch, config.noise, config.load, config.log_above)
+    def of(
+        cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int, devices: int = 1
+    ) -> Teacher:
+        """The teacher with the disturbances and the cost of a configuration, on as many devices as share a batch."""
+        return cls(plant, policy, batch, config.noise, config.load, config.log_above, math.gcd(batch, devices))
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward a step, and the policy's carries (T, ...) with r and y (T,)."""
@@ -155,7 +163,7 @@ class Teacher:
             return jnp.mean(self.log_above * jnp.log1p(cost / self.log_above) if self.log_above else cost)
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
-            cost, gradient = jax.value_and_grad(loss)(actor, keys)
+            cost, gradient = of_all(jax.value_and_grad(loss)(actor, keys))
             finite = jnp.isfinite(optax.tree.norm(gradient))  # else nothing is learned from these episodes
             gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
             with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
@@ -164,10 +172,22 @@ class Teacher:
 
         def step(carry: Any, x: Any) -> tuple[Any, jax.Array]:
             rate, key = x
-            keys = jax.random.split(key, self.batch)
+            keys = own(jax.random.split(key, self.batch))
             return jax.vmap(update, (0, 0, None, None))(carry[0], carry[1], rate, keys)
 
-        return jax.lax.scan(step, carry, (rates, jax.random.split(key, len(rates))))
+        def steps(carry: Any, rates: jax.Array, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
+            return jax.lax.scan(step, carry, (rates, jax.random.split(key, len(rates))))
+
+        def own(keys: chex.PRNGKey) -> chex.PRNGKey:
+            return keys if self.devices == 1 else keys.reshape(self.devices, -1)[jax.lax.axis_index(EPISODES)]
+
+        def of_all(found: Any) -> Any:
+            return found if self.devices == 1 else jax.lax.pmean(found, EPISODES)
+
+        if self.devices > 1:
+            mesh = Mesh(np.array(jax.local_devices()[: self.devices]), (EPISODES,))
+            steps = jax.shard_map(steps, mesh=mesh, in_specs=P(), out_specs=P(), check_vma=False)
+        return steps(carry, rates, key)
 
 
 ADAM = optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam())
@@ -196,6 +216,7 @@ def pretrain(
     key: chex.PRNGKey,
     report: Callable[[Rehearsal], None] = lambda at: None,
     begin: Rehearsal | None = None,
+    devices: int = 1,
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
@@ -208,10 +229,11 @@ def pretrain(
         key: random numbers.
         report: called now and then with the rehearsal so far.
         begin: where a rehearsal with the same arguments was stopped; None: at its beginning.
+        devices: of this process, which share the episodes of a gradient step.
     """
     key_record, *keys = jax.random.split(key, 3)
     if plant.identified:
-        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin)
+        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin, devices)
     lags = config.lags or policy.observer.history
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
@@ -220,7 +242,7 @@ def pretrain(
         data = identify.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin)
+    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices)
 
 
 def rehearse(
@@ -232,6 +254,7 @@ def rehearse(
     keys: Sequence[chex.PRNGKey],
     report: Callable[[Rehearsal], None] = lambda at: None,
     begin: Rehearsal | None = None,
+    devices: int = 1,
 ) -> Any:
     """The actor after so many gradient steps on a differentiable plant, of which each episode is a draw.
 
@@ -241,12 +264,12 @@ def rehearse(
     grows again while that goes well.
 
     Args:
-        config, policy, learned, report, begin: as of `pretrain`.
+        config, policy, learned, report, begin, devices: as of `pretrain`.
         plant, plant_params: with the plant's own length of an episode.
         keys: two, of the whitening and of the episodes.
     """
     key_white, key_run = keys
-    prior, schools = learned.prior, [Teacher.of(config, plant, policy, config.batch_size)]
+    prior, schools = learned.prior, [Teacher.of(config, plant, policy, config.batch_size, devices)]
     longer = config.gradient_steps  # from this step on
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
@@ -255,8 +278,9 @@ def rehearse(
     rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
     while (done := int(at.done)) < config.gradient_steps:
         chunk, school = at.trust * rates[done : done + CHUNK], schools[done >= longer]
-        carry, reward = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
-        reward = np.asarray(reward)[:, 0]
+        found = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
+        carry, reward = jax.device_get(found)  # not left on several devices: what comes in so is compiled for anew
+        reward = reward[:, 0]
         first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
         best = first if done == longer else max(float(at.best), first)
         then = np.int32(done + len(chunk))

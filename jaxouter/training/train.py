@@ -164,7 +164,8 @@ def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], 
         run.forget(seed, done if loads else -1)
         if loads:
             return run.load(seed, done)[0]
-        return trainer.start(seed, params, lambda at: heard(seed, at), run.load_rehearsal(seed))
+        each = run.config.devices // jax.process_count()
+        return trainer.start(seed, params, lambda at: heard(seed, at), run.load_rehearsal(seed), each)
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
     return states if loads or not run.config.epochs else run.fleet.prefill(states, params)

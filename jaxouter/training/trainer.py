@@ -74,12 +74,13 @@ class Trainer:
         params: EnvParams,
         report: Callable[[Rehearsal], None] = lambda at: None,
         begin: Rehearsal | None = None,
+        devices: int = 1,
     ) -> TrainState:
         """State before the prefill.
 
         The static prefilter is identified where the policy is its residual, and the actor pretrained where that is
-        configured, from where a rehearsal of the same seed was stopped or from its beginning; `report` is called with
-        the rehearsal so far.
+        configured, on so many devices of this process, from where a rehearsal of the same seed was stopped or from its
+        beginning; `report` is called with the rehearsal so far.
 
         Raises:
             ValueError: the identification failed.
@@ -91,7 +92,7 @@ class Trainer:
         if self.config.pretraining.gradient_steps:
             key_start = jax.random.fold_in(key_prior, PRETRAINING)
             cfg, plant, learned = self.config.pretraining, self.env.plant, self.policy_params(state)
-            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, report, begin)
+            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, report, begin, devices)
             target = jax.tree.map(jnp.copy, actor)  # the state is donated, and no buffer twice
             state = state._replace(learner=state.learner._replace(actor=actor, target_actor=target))
         return state

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
+from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.devices import Fleet, spread
+from jaxouter.training.pretraining import Teacher
 from jaxouter.training.run import Run
 from jaxouter.training.train import train
 from jaxouter.training.trainer import FIELDS
+from tests import lag
 from tests.training.small import small
 
 SHORT = dict(steps=1_280, epoch=320, noise_sigma=(1e-4, 0.5))  # two epochs
@@ -79,6 +82,21 @@ def test_compiled_loop_copies_no_part_of_the_replay(spanning):
     lines = [line for line in text.splitlines() if f"f32[{part}]" in line or f"f32[1,{part}]" in line]
     assert lines
     assert sum(" copy(" in line for line in lines) <= 1  # before the loop
+
+
+def test_an_actor_rehearsed_on_four_devices_is_that_of_one(tmp_path, monkeypatch):
+    monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
+    taught = []
+    monkeypatch.setattr(Teacher, "of", lambda *given, of=Teacher.of: taught.append(of(*given)) or taught[-1])
+    start = PretrainingConfig(gradient_steps=3, episodes=8, lags=4, batch_size=16)
+    actors = []
+    for devices in (1, 4):
+        config = small("lag", pretraining=start, residual=True, steps=0, devices=devices)
+        finals = train(Run.create(config, tmp_path / str(devices)))
+        assert finals is not None
+        actors.append(finals[0].learner.actor)
+    assert [teacher.devices for teacher in taught] == [1, 4]
+    chex.assert_trees_all_close(*actors, atol=1e-5)
 
 
 def test_houses_on_four_devices_are_those_of_one():
