@@ -68,7 +68,8 @@ class TrainConfig:
     """Runs with consecutive seeds, trained side by side."""
     devices: int = 1
     """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
-    spans several, which share its environments, replay and batch, and then draw otherwise than one."""
+    spans several, which share its environments, replay and batch, and then draw otherwise than one. Those of a process
+    share the episodes of pretraining, seed after seed, with the draws of one."""
     steps: int = 200_000
     """Environment steps of the learner, over all environments, prefill included; 0: the pretrained actor stays."""
     environments: int = 1
