@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import glob
+import re
 import signal
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -29,15 +32,27 @@ LINE_SECONDS = 5.0  # between two plain lines of progress
 
 @contextmanager
 def user_errors() -> Iterator[None]:
-    """A ValueError in here is the user's mistake: one message, exit status 2; a warning is one line."""
+    """A ValueError in here is the user's mistake: one message, exit status 2."""
+    warnings.simplefilter("always", RunWarning)
+    warnings.showwarning = show
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", RunWarning)
-            warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
-            yield
+        yield
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def show(message: Warning | str, *_: object) -> None:
+    """A warning in one line; none of half an entry of the compilation cache, left by a kill or being written now.
+
+    JAX compiles then, but writes no entry where there is one: it is removed, else later processes would compile too.
+    """
+    half = re.match("Error reading persistent compilation cache entry for '(.+?)'", str(message))
+    if half is None:
+        print(f"warning: {message}", file=sys.stderr)
+    else:
+        for entry in Path(jax.config.values["jax_compilation_cache_dir"]).glob(f"{glob.escape(half[1])}-*-cache"):
+            entry.unlink(missing_ok=True)
 
 
 def run(main: Callable[[], None]) -> None:
@@ -53,6 +68,7 @@ def use_compilation_cache() -> None:
     if not jax.config.values["jax_compilation_cache_dir"]:
         jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
+    warnings.showwarning = show
 
 
 def use_plants(sources: Iterable[Source]) -> None:

@@ -77,3 +77,24 @@ def test_a_second_run_into_one_folder_is_refused(tmp_path):
     assert f"is being trained by process {os.getpid()}" in done.stderr
     assert "Traceback" not in done.stderr
     assert files == {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+
+
+def test_half_an_entry_of_the_compilation_cache_is_made_anew_without_a_word(tmp_path):
+    """As a kill while it is written leaves it: JAX alone would warn and compile again in each later process."""
+    lines = [
+        "import jax",
+        "from jaxouter import cli",
+        "cli.use_compilation_cache()",
+        'jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)',
+        "print(jax.jit(lambda x: 2 * x + 1)(20.5))",
+    ]
+    command = ["env", f"JAX_COMPILATION_CACHE_DIR={tmp_path}", sys.executable, "-c", "\n".join(lines)]
+    assert ended(*command).stdout == "42.0\n"
+    entries = list(tmp_path.glob("*-cache"))
+    assert entries
+    for entry in entries:
+        os.truncate(entry, entry.stat().st_size // 2)
+    halves = {entry: entry.stat().st_size for entry in entries}
+    done = ended(*command)
+    assert (done.stdout, done.stderr) == ("42.0\n", "")
+    assert all(entry.stat().st_size > half for entry, half in halves.items())
