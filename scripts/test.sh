@@ -1,6 +1,5 @@
 #!/usr/bin/env bash
-# Lint, types and tests, those of plants and loop in double precision too, in under 12 minutes on 2 cores: most of what
-# runs there is small, so XLA is told to compile fast rather than well. All else compiles as it does for users:
+# Lint, types and tests, those of plants and loop in double precision too, in under 12 minutes on 2 cores.
 # --all, under 80 minutes: also the slow tests, all others in double precision with checks for NaN, places broken on
 # purpose, 20 kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time,
 # see peers.sh). --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time
@@ -8,7 +7,10 @@
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder "$@"; }
-in_double() { JAX_ENABLE_X64=1 tests "$@"; }
+fast() {  # XLA compiles fast rather than well: most of what runs in tests is small
+    XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false ${XLA_FLAGS:-}" "$@"
+}
+in_double() { JAX_ENABLE_X64=1 fast tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
 documentation() { NO_MKDOCS_2_WARNING=1 "$PYTHON" -m mkdocs build --strict --quiet && "$PYTHON" scripts/docs.py; }
@@ -28,8 +30,7 @@ part() {  # TITLE COMMAND...: run it, and note its last line, minutes, commit an
 "$PYTHON" -m ruff check .
 "$PYTHON" -m basedpyright --pythonpath "$PYTHON"
 if [ $# -eq 0 ]; then
-    export XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false ${XLA_FLAGS:-}"
-    tests
+    fast tests
     in_double tests/plants tests/loop
 elif [ "$1" = --all ]; then
     only=${*:2}
@@ -39,7 +40,7 @@ elif [ "$1" = --all ]; then
     part "all tests, the slow ones too" tests --all
     part "plants and loop, double precision" in_double --all tests/plants tests/loop
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
-    part "places broken on purpose" "$PYTHON" scripts/mutants.py
+    part "places broken on purpose" fast "$PYTHON" scripts/mutants.py
     part "20 kills" "$PYTHON" scripts/soak.py
     part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py

@@ -13,7 +13,7 @@ from jaxouter.plants import sources
 from jaxouter.training.run import Run
 from tests.load import ROOT
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
 def learned(plant: str, folder) -> dict:
