@@ -1,6 +1,11 @@
 """jaxouter learns an outer loop: it sees the reference r and the output y, and chooses the modified reference r~."""
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any
+
+if sys.version_info < (3, 12):  # jaxlib 0.10, which complains of its own compilation cache (jax issue 38445)
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 if TYPE_CHECKING:
     from jaxouter.loop.environment import make

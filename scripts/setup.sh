@@ -2,19 +2,19 @@
 # Sets PYTHON to its interpreter. Uses the python3 on the path, or the one that the variable PYTHON names.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-venv=$root/.venv
+venv=${VENV:-$root/.venv}
 
 fail() { printf 'error: %s\n' "$*" >&2; exit 2; }
 
 find_python() {
     local candidate
-    for candidate in "${PYTHON:-python3}" python3.13 python3.12 python3.11; do
-        if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; then
+    for candidate in "${PYTHON:-python3}" python3.14 python3.13 python3.12 python3.11; do
+        if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null; then
             printf '%s\n' "$candidate"
             return
         fi
     done
-    fail "Python 3.11, 3.12 or 3.13 is needed and was not found; install one, or name it: PYTHON=/path/to/python3 bash $0"
+    fail "Python 3.11 to 3.14 is needed and was not found; install one, or name it: PYTHON=/path/to/python3 bash $0"
 }
 
 wanted=$(cat "$root/requirements.lock" "$root/pyproject.toml" | cksum)

@@ -13,6 +13,19 @@ fast() {  # XLA compiles fast rather than well: most of what runs in tests is sm
 in_double() { JAX_ENABLE_X64=1 fast tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
+second_python() {  # the default suite by the first of these that is there and is another than the default one
+    local python version own
+    own=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+    for version in 3.14 3.13 3.12; do
+        for python in "python$version" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version".*/bin/python; do
+            if [ "$version" != "$own" ] && "$python" -c 'import ensurepip' 2>/dev/null; then
+                PYTHON=$python VENV=$root/.venv-$version bash scripts/test.sh
+                return
+            fi
+        done
+    done
+    echo "skipped: no Python 3.12 to 3.14 beside $own on the path or under pyenv"
+}
 documentation() { NO_MKDOCS_2_WARNING=1 "$PYTHON" -m mkdocs build --strict --quiet && "$PYTHON" scripts/docs.py; }
 commit=$(git rev-parse --short HEAD)$(git diff --quiet HEAD -- . ':!benchmarks/results' || echo -dirty)
 result=benchmarks/results/tests.md failed=0
@@ -42,6 +55,7 @@ elif [ "$1" = --all ]; then
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" fast "$PYTHON" scripts/mutants.py
     part "20 kills" "$PYTHON" scripts/soak.py
+    part "a second Python: the default suite" second_python
     part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py
     exit $failed

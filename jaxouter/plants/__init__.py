@@ -11,7 +11,7 @@ from typing import Any
 import chex
 import jax
 
-from jaxouter.plants import heaters, pitch
+from jaxouter.plants import heaters, pitch, versions
 from jaxouter.plants.base import Plant
 
 __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate"]
@@ -19,6 +19,7 @@ __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simu
 Ranges = tuple[tuple[str, float, float], ...]
 """Names of a plant's numbers, and between what each is drawn."""
 
+versions.warn()
 SHORT = 4  # elements of a vector that have names
 REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
 

@@ -1,0 +1,22 @@
+"""Versions of jaxlib that must not be used; the package's requirements exclude them, an environment may hold them."""
+
+from __future__ import annotations
+
+import warnings
+from importlib.metadata import version
+
+FAULTS = {
+    "0.10.2": "computes wrongly on a CPU, without a word (jax issue 39103)",
+    "0.11.0": "is not supported: it precedes the repairs of 0.11.2 (jax issues 39103, 40101)",
+    "0.11.1": "copies the whole replay at each write (jax issue 40101)",
+}
+
+
+def warn(installed: str | None = None) -> None:
+    """Warn where the installed jaxlib (None: look it up) is one of `FAULTS`."""
+    installed = version("jaxlib") if installed is None else installed
+    if installed in FAULTS:
+        warnings.warn(
+            f"jaxlib {installed} {FAULTS[installed]}; install another: python -m pip install --upgrade jaxouter",
+            stacklevel=2,
+        )
