@@ -21,6 +21,7 @@ from rich.table import Table
 
 from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
+from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.training.config import OWN, PRESETS, TrainConfig
@@ -144,10 +145,10 @@ class TrainingProgress:
         """Show the row of an epoch."""
         cfg, epoch, now = self._config, row["epoch"], time.monotonic()
         if epoch == 0:
-            return self._show(seed, f"pretrained  MAE {row['mae']:.3f} {self._unit}")
+            return self._show(seed, f"pretrained  MAE {number(row['mae'])} {self._unit}")
         text = (
             f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
-            f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {row['mae']:.3f} {self._unit}"
+            f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {number(row['mae'])} {self._unit}"
         )
         if row.get("skipped", 0) or row.get("no_action", 0):
             text += f"  {row['skipped']:.1%} of the updates skipped, {row['no_action']:.1%} of the actions not finite"
@@ -253,6 +254,6 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
     console.print(out)
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A figure for a table; a dash where it is not defined."""
-    return "-" if value is None else f"{value:.{digits}f}" if abs(value) < 1000 else f"{value:.3g}"
+def number(value: float | None, digits: int = 4) -> str:
+    """A figure for a table, with so many significant digits whatever its unit; a dash where it is not defined."""
+    return "-" if value is None else significant(value, digits)

@@ -219,11 +219,11 @@ def show(
         values = [figures["mae"] for figures in of_seeds if figures["mae"] is not None]
         ours = cli.number(statistics.median(values)) if len(values) == len(of_seeds) else "diverged"
         if len(values) > 1:
-            ours += f" ({min(values):.3f}-{max(values):.3f})"
+            ours += f" ({cli.number(min(values))}-{cli.number(max(values))})"
         better = [figures["improvement"] for figures in of_seeds if figures["improvement"] is not None]
         paper = "-" if scenario.paper is None else f"{scenario.paper[1]:.2f} of {scenario.paper[0]:.2f}"
         inner, static = (simple[name][scenario.id][1]["mae"] for name in ("none", "static"))
-        improvement = cli.number(statistics.median(better), 1) if better else "-"
+        improvement = cli.number(statistics.median(better), 3) if better else "-"
         place = [places[scenario.id]] if places else []
         rows.append([scenario.id, *place, cli.number(inner), cli.number(static), paper, ours, improvement])
     unit = met[0].plant.y_unit

@@ -1,12 +1,13 @@
 """First-order lag with a dead time, T y' = K r~(t - d) - y: a third plant in one file.
 
-Units: y and r~ have none; time in s.
+Units: y and r~ are in multiples of `unit`, as which all sizes are declared; time in s.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from functools import cache
 from typing import NamedTuple
 
 import chex
@@ -28,6 +29,7 @@ class LagParams:
     T: jax.Array  # time constant, s
     d: jax.Array  # dead time, s
     max_delay: float = struct.field(pytree_node=False)  # s; static: sets the length of the delay line
+    unit: float = struct.field(pytree_node=False, default=1.0)  # size of what is otherwise 1
 
 
 class LagState(NamedTuple):
@@ -39,9 +41,15 @@ class LagState(NamedTuple):
 
 
 def make(
-    *, K: float = 0.5, T: float = 0.3, d: float = 0.25, max_delay: float | None = None, randomise: bool = False
+    *,
+    K: float = 0.5,
+    T: float = 0.3,
+    d: float = 0.25,
+    max_delay: float | None = None,
+    randomise: bool = False,
+    unit: float = 1.0,
 ) -> tuple[Plant, LagParams]:
-    """The lag and its parameters; `randomise` draws K within 10 % at each reset.
+    """The lag and its parameters; `randomise` draws K within 10 % at each reset, `unit` is the size of y.
 
     Raises:
         ValueError: d is negative or above max_delay (None: the smallest that serves).
@@ -50,8 +58,16 @@ def make(
         max_delay = math.ceil(round(d / CONTROL_STEP, 6)) * CONTROL_STEP
     if not 0.0 <= d <= max_delay:
         raise ValueError(f"d is {d} s; a dead time must lie in [0, max_delay] = [0, {max_delay:g}] s")
-    params = LagParams(K=array("K", K, ()), T=array("T", T, ()), d=array("d", d, ()), max_delay=max_delay)
-    return RANDOMISED if randomise else LAG, params
+    params = LagParams(array("K", K, ()), array("T", T, ()), array("d", d, ()), max_delay, unit)
+    return (RANDOMISED if randomise else LAG) if unit == 1.0 else _in_unit(unit), params
+
+
+@cache
+def _in_unit(unit: float) -> Plant:
+    """The lag with every size that it declares so many times as large."""
+    sizes = ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds")
+    scaled = {name: (unit * getattr(LAG, name)[0], unit * getattr(LAG, name)[1]) for name in sizes}
+    return dataclasses.replace(LAG, error_scale=0.0, **scaled)
 
 
 def init(key: chex.PRNGKey, params: LagParams) -> LagState:
@@ -62,8 +78,8 @@ def init(key: chex.PRNGKey, params: LagParams) -> LagState:
 
 
 def start(key: chex.PRNGKey, params: LagParams) -> LagState:
-    """A training start: y uniform in plus or minus 0.5."""
-    return init(key, params)._replace(y=jax.random.uniform(key, (), float, -0.5, 0.5))
+    """A training start: y uniform in plus or minus half a unit."""
+    return init(key, params)._replace(y=params.unit * jax.random.uniform(key, (), float, -0.5, 0.5))
 
 
 def draw(key: chex.PRNGKey, params: LagParams) -> LagParams:

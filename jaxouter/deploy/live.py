@@ -243,7 +243,7 @@ class Live:
         earlier, price = before.memory.r_tilde_past[0], rewards.params(self.trainer.env.plant)
         reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier)
         action, never = self._action(prior, before.r, before.r_tilde), jnp.zeros_like(y)
-        return jnp.stack([*signals, action, self.trainer.config.reward_scale * reward, never, never])
+        return jnp.stack([*signals, action, self.trainer.reward_scale * reward, never, never])
 
     def _action(self, prior: AffineParams, r: jax.Array, r_tilde: jax.Array) -> jax.Array:
         """The action of which r~ comes; beyond [-1, 1] where r passed through."""
@@ -323,5 +323,5 @@ def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[Trai
     plant, _ = arx.make(FOLLOWS, [FOLLOWS], **said)
     observer = Observer.of(plant)
     ddpg = replace(DEFAULT.ddpg, hidden=(64, 64), batch_size=128, discount=0.95)  # an update fits into milliseconds
-    config = replace(DEFAULT, plant=NAME, reward_scale=1.0 / observer.y_scale, ddpg=ddpg)
+    config = replace(DEFAULT, plant=NAME, ddpg=ddpg)
     return config, Environment(plant, observer, SetPoint(*plant.setpoint_range))

@@ -437,7 +437,7 @@ def _range(scenario: Scenario, traces: Mapping[str, Traces]) -> tuple[float, flo
     outer = [own for name, own in traces.items() if name != "none"] or [*traces.values()]
     shown = np.concatenate([outer[0].r[0], *(np.append(own.y0[0], own.y[0]) for own in outer)])
     shown = np.clip(shown[np.isfinite(shown)], low, high)
-    margin = 0.06 * (shown.max() - shown.min()) + 1e-6
+    margin = 0.06 * (shown.max() - shown.min()) + 1e-6 * scenario.plant.error_scale
     return float(shown.min() - margin), float(shown.max() + margin)
 
 

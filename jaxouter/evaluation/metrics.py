@@ -13,7 +13,15 @@ from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.plants import Plant
 
 BAND = 0.05  # of the step, for the settling time
-ROUNDING = 1e-4  # in the unit of y, by which a limit that is just met may be exceeded
+ROUNDING = 1e-4  # of the error scale, by which a limit that is just met may be exceeded
+NO_STEP = 1e-6  # likewise, below which a set-point is where y already is
+
+
+def significant(value: float, digits: int) -> str:
+    """A figure of merit for people, with so many significant digits and all digits before the point up to a million."""
+    if 10**digits - 0.5 <= abs(value) < 1e6:
+        return f"{value:,.0f}"
+    return f"{value:#,.{digits}g}".rstrip(".")
 
 
 def mae(traces: Traces) -> float:
@@ -60,7 +68,7 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
     if inner_mae is not None and scenario.stable_alone:
         values["improvement"] = 100.0 * (1.0 - values["mae"] / inner_mae)
     if scenario.segments:
-        segments = [_segment(y_start, r, y, dt) for y_start, r, y in _segments(traces)]
+        segments = [_segment(y_start, r, y, dt, NO_STEP * plant.error_scale) for y_start, r, y in _segments(traces)]
         itae, overshoot, settling, steady = (np.array(column) for column in zip(*segments, strict=True))
         values["itae"], values["steady_state_error"] = float(itae.mean()), float(steady.mean())
         steps = np.isfinite(overshoot)  # a set-point at which y already is has no step
@@ -70,7 +78,10 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
             values["settling_time"] = median if np.isfinite(median) else None
     if plant.output_limit is not None or plant.rate_limit is not None:
         over = np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
-        values["violation_time"], values["violation_max"] = float((over > ROUNDING).mean()), float(max(0.0, over.max()))
+        values["violation_time"], values["violation_max"] = (
+            float((over > ROUNDING * plant.error_scale).mean()),
+            float(max(0.0, over.max())),
+        )
         if plant.members is not None:
             values["violation_time_each"] = float(traces.each_outside.mean())
             values["violation_max_each"] = float(max(0.0, traces.each_excess.max()))
@@ -88,12 +99,12 @@ def _segments(traces: Traces) -> Iterator[tuple[float, float, np.ndarray]]:
             yield (y0 if a == 0 else y[a - 1]), r[a], y[a:b].astype(np.float64)
 
 
-def _segment(y_start: float, r: float, y: np.ndarray, dt: float) -> tuple[float, float, float, float]:
+def _segment(y_start: float, r: float, y: np.ndarray, dt: float, no_step: float) -> tuple[float, float, float, float]:
     """itae, overshoot (%), settling time and steady-state error of one set-point; nan where there is no step."""
     e, step, t = np.abs(r - y), float(r - y_start), dt * np.arange(1, len(y) + 1)
     itae = float((t * e).sum() * dt)
     steady = float(abs(np.mean(r - y[-max(1, len(y) // 10) :])))
-    if abs(step) < 1e-6:
+    if abs(step) < no_step:
         return itae, np.nan, np.nan, steady
     overshoot = 100.0 * max(0.0, float(np.max((y - r) * np.sign(step)))) / abs(step)
     outside = np.flatnonzero(e > BAND * abs(step))

@@ -12,6 +12,7 @@ import jinja2
 import numpy as np
 
 from jaxouter.evaluation.figures import symbol
+from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.statistics import Line, lines
 
 KIND_NAMES = {
@@ -108,11 +109,7 @@ def merits(y_unit: str, time_unit: str) -> list[Merit]:
 
 def figure(value: float | None) -> str:
     """A number with three digits; a dash where there is none."""
-    if value is None:
-        return "–"
-    if 999.5 <= abs(value) < 1e6:
-        return f"{value:,.0f}"
-    return f"{value:#.3g}".rstrip(".")
+    return "–" if value is None else significant(value, 3)
 
 
 def ratio(value: float | None) -> str:

@@ -22,7 +22,7 @@ NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
 Place = Literal["inside", "edge", "outside"]
 OF_THE_START = ("x0_mean", "x0_spread", "weights")
-ROUNDING = 1e-5
+ROUNDING = 1e-5  # of a number of the plant, by which it may lie outside its range
 PITCH_SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
 PITCH_MAX_DELAY = (
     5.7  # s; one length of the delay lines for all scenarios with delays of u, which so share a compilation
@@ -220,10 +220,11 @@ def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
     edge = False
     for name, leaf in found:
         low, high = bounds[name]
-        if np.any(leaf < low - ROUNDING) or np.any(leaf > high + ROUNDING):
+        slack = ROUNDING * np.maximum(np.abs(low), np.abs(high))
+        if np.any(leaf < low - slack) or np.any(leaf > high + slack):
             return "outside"
         if name != "noise":
-            edge |= bool(np.any((low < high) & ((leaf < low + ROUNDING) | (leaf > high - ROUNDING))))
+            edge |= bool(np.any((low < high) & ((leaf < low + slack) | (leaf > high - slack))))
     return "edge" if edge else "inside"
 
 

@@ -25,7 +25,7 @@ class RewardParams:
 
 
 def params(plant: Plant, divergence: float = -50.0) -> RewardParams:
-    """The paper's constants, with the thresholds and limits that the plant declares."""
+    """The paper's constants, with the thresholds and limits that the plant declares; divergence in error scales."""
 
     def declared(value: float | None) -> jax.Array:
         return jnp.asarray(jnp.inf if value is None else value, float)
@@ -39,7 +39,7 @@ def params(plant: Plant, divergence: float = -50.0) -> RewardParams:
         delta_b=declared(1.0),
         output_limit=declared(plant.output_limit),
         rate_limit=declared(plant.rate_limit),
-        divergence=declared(divergence),
+        divergence=declared(divergence * plant.error_scale),
     )
 
 

@@ -67,6 +67,9 @@ class Plant:
     move_threshold: float | None = None
     """Moves of r~ and of y of at least this size are charged (the paper's rho_h and rho_b); default: 3 % of the range
     of r~, inf: none. Where moves cost nothing, an r~ that goes to and fro between its bounds may be what is learned."""
+    error_scale: float = 0.0
+    """Error that counts as one for the learner, in `y_unit`: costs, the price of divergence and rounding are told in
+    terms of it, so that no result depends on the unit; 0: a twentieth of the set-point range."""
     history: int = 15
     """Default number of past samples of y and r~ in the observation."""
     families: tuple[str, ...] = ("steps", "staircase", "ramps")
@@ -108,6 +111,8 @@ class Plant:
         beyond = 2 * (high - low)
         if self.move_threshold is None:
             object.__setattr__(self, "move_threshold", MOVE * (high - low))
+        if self.error_scale == 0.0:
+            object.__setattr__(self, "error_scale", (self.setpoint_range[1] - self.setpoint_range[0]) / 20)
         object.__setattr__(self, "evaluation_range", self.evaluation_range or self.setpoint_range)
         object.__setattr__(self, "divergence_bounds", self.divergence_bounds or (low - beyond, high + beyond))
         for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):

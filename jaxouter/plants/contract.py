@@ -94,14 +94,14 @@ def behaviour(plant: Plant, params: Any) -> Iterator[tuple[str, str | None]]:
     few = r_tilde[:STEPS]
     with jax.disable_jit(plant.differentiable):
         plain = np.asarray(run(params, keys[0], few))
-    yield "the same when compiled", _compared(y[:STEPS], plain)
+    yield "the same when compiled", _compared(plant, y[:STEPS], plain)
     alone = np.stack([compiled(params, key, few) for key in keys])
     together = np.asarray(jax.jit(jax.vmap(partial(run, params), (0, None)))(keys, few))
-    yield "the same side by side, under vmap", _compared(alone, together)
+    yield "the same side by side, under vmap", _compared(plant, alone, together)
 
 
-def _compared(wanted: np.ndarray, got: np.ndarray) -> str | None:
-    range_ = max(1e-6, float(np.nanmax(np.abs(wanted), initial=0.0)))
+def _compared(plant: Plant, wanted: np.ndarray, got: np.ndarray) -> str | None:
+    range_ = max(plant.error_scale, float(np.nanmax(np.abs(wanted), initial=0.0)))
     return None if np.allclose(wanted, got, rtol=0.0, atol=ROUNDING * range_, equal_nan=True) else _off(wanted, got)
 
 

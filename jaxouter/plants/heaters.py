@@ -268,6 +268,7 @@ HEATERS = Plant(
     divergence_bounds=(-20.0, 60.0),
     rate_limit=1.0,
     move_threshold=1.0,
+    error_scale=1.0,
     history=5,
     families=("steps", "staircase", "ramps", "days"),
     family_steps=200,

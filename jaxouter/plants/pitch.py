@@ -398,6 +398,7 @@ PITCH = Plant(
     divergence_bounds=(-60.0, 60.0),
     output_limit=18.0,
     move_threshold=3.5,
+    error_scale=1.0,
     history=15,
     families=("steps", "staircase", "ramps", "sines", "doublets"),
     family_steps=600,

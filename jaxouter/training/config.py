@@ -93,7 +93,7 @@ class TrainConfig:
     residual: bool = False
     """Learn a correction of the static prefilter, identified first, instead of r~ itself."""
     reward_scale: float = 1.0
-    """Multiplies the reward before it is learned from."""
+    """Multiplies the reward, in the plant's error scales, before it is learned from."""
     noise_theta: float = 0.15
     """Rate of return of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
     noise_sigma: tuple[float, float] = (0.2, 0.2)

@@ -89,7 +89,7 @@ class Teacher:
         return cls(plant, policy, batch, config.noise, config.load, config.log_above, math.gcd(batch, devices))
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
-        """One episode: mean reward a step, and the policy's carries (T, ...) with r and y (T,)."""
+        """One episode: mean reward a step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
         plant, steps = self.plant, self.plant.episode_steps
         key_draw, key_start, key_r, key_run, key_quiet, key_noise, key_load = jax.random.split(key, 7)
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
@@ -109,7 +109,7 @@ class Teacher:
             state = plant.step(plant_params, state, r_tilde + load_k, key)
             y_next = plant.output(plant_params, state)
             reward = rewards.reward(price, r_k, y_next, y, r_tilde, before)
-            return (state, after, y_next, r_tilde), (reward, carry, r_k, y_seen)
+            return (state, after, y_next, r_tilde), (reward / plant.error_scale, carry, r_k, y_seen)
 
         begin = (state, policy.init(policy_params, r[0], y + noise[0]), y, jnp.clip(y, *plant.r_tilde_bounds))
         _, (reward, *seen) = jax.lax.scan(step, begin, (r, noise, load, jax.random.split(key_run, steps)))

@@ -68,6 +68,11 @@ class Trainer:
         """The learner inside the policy."""
         return self.policy.learner
 
+    @property
+    def reward_scale(self) -> float:
+        """From the plant's reward to the learner's, whatever the unit of y."""
+        return self.config.reward_scale / self.env.plant.error_scale
+
     def start(
         self,
         seed: int,
@@ -156,7 +161,7 @@ class Trainer:
             y_next=info["y"],
         )
         flags = [flag.astype(reward.dtype) for flag in (terminated, truncated)]
-        row = jnp.stack([*signals, action, reward * self.config.reward_scale, *flags], -1)
+        row = jnp.stack([*signals, action, reward * self.reward_scale, *flags], -1)
         state = state._replace(
             env=env,
             obs=obs,
@@ -303,7 +308,7 @@ class Trainer:
         obs, env = self.env.reset(key_reset, params)
         keys = jax.random.split(key_run, self.env.plant.episode_steps)
         (last, _, weight), rewards = jax.lax.scan(step, (obs, env, jnp.ones_like(env.y)), keys)
-        return value(obs), self.config.reward_scale * jnp.sum(rewards) + weight * value(last)
+        return value(obs), self.reward_scale * jnp.sum(rewards) + weight * value(last)
 
 
 def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:

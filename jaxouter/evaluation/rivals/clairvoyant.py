@@ -65,7 +65,7 @@ def plan(scenario: Scenario) -> Plan:
 
     Returns:
         Plan. `rollout(Replay(), plan.r_tilde, scenario, per_episode=True)` has its MAE, to the rounding of single
-        precision: about 1e-5 in the unit of y.
+        precision: about 1e-5 of the plant's error scale.
 
     Raises:
         ValueError: the plant is not affine in r~ with additive noise.
@@ -164,13 +164,14 @@ def _solve(
     Variables, each (T,): u = r~ - base; p, n >= 0 with y = r - p + n, of which at the optimum one is |r - y| and the
     other 0; s >= 0 by which the limits are left.
     """
-    steps = len(r)
+    steps, unit = len(r), plant.error_scale  # the solver's tolerances are absolute
+    y0, y_base, r = y0 / unit, y_base / unit, r / unit
     eye, none = sp.eye_array(steps), sp.csr_array((steps, steps))
     rows, bounds = [], []
     for limit, change, start in _limits(plant, steps, y0):
         rows += [[none, -change, change, -eye], [none, change, -change, -eye]]  # change @ y - start within the limit
         bounds += [limit - change @ r + start, limit + change @ r - start]
-    u_bound = (plant.r_tilde_bounds[1] - plant.r_tilde_bounds[0]) / 2
+    u_bound = (plant.r_tilde_bounds[1] - plant.r_tilde_bounds[0]) / 2 / unit
     program = dict(
         c=np.repeat([0.0, 1.0, 1.0, PRICE], steps),
         A_eq=sp.block_array([[G, eye, -eye, none]], format="csr"),
@@ -182,16 +183,16 @@ def _solve(
     result = linprog(**program, method="highs-ds")  # the interior-point method fails on some of these
     if result.x is None:
         raise RuntimeError(f"the linear program of the clairvoyant plan was not solved: {result.message}")
-    u, p, n, s = result.x.reshape(4, steps)
+    u, p, n, s = unit * result.x.reshape(4, steps)
     return u + sum(plant.r_tilde_bounds) / 2, float(np.mean(p + n)), float(s.max())
 
 
 def _limits(plant: Plant, steps: int, y0: float) -> list[tuple[float, sp.csr_array, np.ndarray]]:
-    """Each limit as (limit, M, start): |M y - start| <= limit, y (steps,)."""
+    """Each limit as (limit, M, start): |M y - start| <= limit, y (steps,); all in error scales."""
     limits = []
     if plant.output_limit is not None:
-        limits.append((plant.output_limit, sp.eye_array(steps, format="csr"), np.zeros(steps)))
+        limits.append((plant.output_limit / plant.error_scale, sp.eye_array(steps, format="csr"), np.zeros(steps)))
     if plant.rate_limit is not None:
         difference = (sp.eye_array(steps) - sp.eye_array(steps, k=-1)).tocsr()
-        limits.append((plant.rate_limit, difference, np.eye(steps)[0] * y0))
+        limits.append((plant.rate_limit / plant.error_scale, difference, np.eye(steps)[0] * y0))
     return limits

@@ -45,7 +45,7 @@ def returns(school: Teacher, actors: Any, prior: AffineParams, plant_params: Any
     def mean(actor: Any) -> jax.Array:
         keys = jax.random.split(key, VALIDATION)
         each = jax.vmap(lambda key: school.episode(school.policy, LearnedParams(actor, prior), plant_params, key)[0])
-        return jnp.mean(each(keys)) * school.plant.episode_steps
+        return jnp.mean(each(keys)) * school.plant.episode_steps * school.plant.error_scale
 
     return jax.lax.map(mean, actors)
 

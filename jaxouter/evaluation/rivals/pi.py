@@ -75,7 +75,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         tried = gains(x)
         best.append((score(policy, tried, episodes), tried))
         report(f"{len(best)} tried")
-        return -best[-1][0] if np.isfinite(best[-1][0]) else 1e6
+        return -best[-1][0] / plant.error_scale if np.isfinite(best[-1][0]) else 1e6
 
     bounds = [(0.0, 5.0), (0.01, 6.0)]
     options = {"maxfev": (budget - spent) // each, "initial_tr_radius": 0.5, "final_tr_radius": 1e-3}

@@ -86,7 +86,7 @@ class Solver:
             l=np.concatenate([self._low, -qp.rows_bound]),
             u=np.concatenate([self._high, qp.rows_bound]),
             verbose=False,
-            eps_abs=TOLERANCE * max(1.0, abs(qp.high)),
+            eps_abs=TOLERANCE * max(abs(qp.low), abs(qp.high)),
             eps_rel=TOLERANCE,
             max_iter=2000,
             adaptive_rho=True,
