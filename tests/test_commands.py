@@ -24,6 +24,7 @@ from tests.training.small import small
 SMALL = ["--steps", "1600", "--prefill", "640", "--epoch", "480", "--environments", "8", "--replay", "1600"]
 SMALL += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
 SMALL += ["--pretraining.gradient-steps", "0"]
+PLACES = {"pitch/paper": "inside"} | {f"pitch/delay-{name}": "outside" for name in ("5.7", "0.57", "swapped")}
 
 
 def command(module: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -34,43 +35,42 @@ def command(module: str, *arguments: str, cwd: Path) -> subprocess.CompletedProc
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Output and folder of a small run of two seeds on the heaters, through the real entry point."""
+    """Output and folder of a small run of two seeds on pitch, through the real entry point."""
     folder = tmp_path_factory.mktemp("train")
-    drawn = ["--randomise", "x_out", "-12", "0"]
-    done = command("train", "heaters", *SMALL, *drawn, "--seed", "3", "--seeds", "2", cwd=folder)
+    drawn = ["--randomise", "gain", "0.8", "1.2"]
+    done = command("train", "pitch", *SMALL, *drawn, "--seed", "3", "--seeds", "2", cwd=folder)
     assert done.returncode == 0, done.stderr
-    return done, folder / "runs" / "heaters-default-3"
+    return done, folder / "runs" / "pitch-default-3"
 
 
 def test_train_writes_the_run_folder(trained):
     _, folder = trained
     config = json.loads((folder / "config.json").read_text())["config"]
-    assert (config["plant"], config["steps"], config["seeds"]) == ("heaters", 1600, 2)
-    assert config["ddpg"]["discount"] == 0.95  # of the preset
+    assert (config["plant"], config["steps"], config["seeds"]) == ("pitch", 1600, 2)
+    assert config["integral_steps"] == 20.0  # of the preset
     for seed in (3, 4):
         rows = [json.loads(line) for line in (folder / f"seed-{seed}" / "metrics.jsonl").read_text().splitlines()]
         assert [row["steps"] for row in rows] == [1120, 1600]
         assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
-    assert names == {"paper.png", "learning-curve.png", "heaters-paper-4.png", "heaters-paper-1000.png"}
+    assert names == {"paper.png", "learning-curve.png", *(f"{name.replace('/', '-')}.png" for name in PLACES)}
     summary = json.loads((folder / "summary.json").read_text())
     assert [(r["policy"], r.get("seed")) for r in summary["results"]] == [
         ("learned", 3), ("learned", 4), ("none", None), ("static", None)
     ]  # fmt: skip
-    assert summary["places"] == {"heaters/paper-4": "inside", "heaters/paper-1000": "inside"}
+    assert summary["places"] == PLACES
 
 
 @of_single_draws
 def test_train_ends_with_the_table_and_the_main_figure(trained):
     done, folder = trained
     for text in (
-        "heaters/paper-4",
-        "heaters/paper-1000",
+        *PLACES,
         "inner loop alone",
         "static prefilter",
-        "1.17 of 15.62",
-        "15.59",
-        "each plant has its own x_out, from -12 to 0",
+        "3.90 of 10.91",
+        "10.91",
+        "each plant has its own gain, from 0.8 to 1.2",
         "inside",
     ):
         assert text in done.stdout
@@ -83,22 +83,22 @@ def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):
     maes = {}
     for name, path in (("run", folder), ("seed-3", folder / "seed-3"), ("seed-4", folder / "seed-4")):
         out = tmp_path / f"{name}.json"
-        evaluate.main([str(path), "--scenario", "heaters/paper-4", "--json", str(out)])
+        evaluate.main([str(path), "--scenario", "pitch/paper", "--json", str(out)])
         content = json.loads(out.read_text())
         assert content["policy"] == "learned"
-        maes[name] = content["scenarios"]["heaters/paper-4"]["mae"]
+        maes[name] = content["scenarios"]["pitch/paper"]["mae"]
     summary = json.loads((folder / "summary.json").read_text())
-    expected = [result["scenarios"]["heaters/paper-4"]["mae"] for result in summary["results"][:2]]
+    expected = [result["scenarios"]["pitch/paper"]["mae"] for result in summary["results"][:2]]
     assert [maes["seed-3"], maes["seed-4"]] == pytest.approx(expected, rel=1e-4)
     assert maes["run"] == pytest.approx(min(expected), rel=1e-4)
 
 
 def test_evaluate_says_where_plants_lie_among_those_of_the_training(trained, capsys):
-    scenarios = ["heaters/paper-4", "heaters/cold"]
+    scenarios = ["pitch/paper", "pitch/delay-0.57"]
     evaluate.main([str(trained[1]), "--scenario", *scenarios, "--episodes", "1"])
-    lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines() if "heaters/" in line}
+    lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines() if "pitch/" in line}
     assert ["inside" in lines[name] for name in scenarios] == [True, False]
-    assert "outside" in lines["heaters/cold"]
+    assert "outside" in lines["pitch/delay-0.57"]
 
 
 def test_evaluate_through_its_entry_point_writes_figures_and_traces(tmp_path):
@@ -205,8 +205,8 @@ def test_run_without_or_with_a_damaged_checkpoint_is_refused(tmp_path, capsys):
 
 def test_run_of_one_plant_is_not_evaluated_on_another(trained, capsys):
     with pytest.raises(SystemExit):
-        evaluate.main([str(trained[1]), "--scenario", "pitch/paper"])
-    assert "is a run on heaters; pitch/paper is another plant's" in capsys.readouterr().err
+        evaluate.main([str(trained[1]), "--scenario", "heaters/cold"])
+    assert "is a run on pitch; heaters/cold is another plant's" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
@@ -258,7 +258,7 @@ def test_resume_of_a_finished_run_only_shows_it_again(trained, capsys):
     _, folder = trained
     before = (folder / "seed-3" / "metrics.jsonl").read_text()
     train.main(["--resume", str(folder)])
-    assert "heaters/paper-1000" in capsys.readouterr().out
+    assert "pitch/delay-swapped" in capsys.readouterr().out
     assert (folder / "seed-3" / "metrics.jsonl").read_text() == before
 
 

@@ -28,6 +28,7 @@ def ended(*command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*command], capture_output=True, text=True, timeout=250)
 
 
+@pytest.mark.slow
 def test_three_kills_change_nothing(tmp_path):
     soak = load("scripts", "soak")
     content = soak.soak(soak.Options(kills=3, within=8.0, seeds=1, steps=20_640, out=tmp_path / "soak.json"))
