@@ -8,7 +8,7 @@ recorded y. So a record of (r~, y) and a fitted response make a plant that can b
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import chex
@@ -106,8 +106,9 @@ def _moved(original: Plant, params: Any, keys: chex.PRNGKey) -> Any:
     return jax.lax.map(episode, keys, batch_size=256)
 
 
+@cache
 def plant(original: Plant, lags: int) -> Plant:
-    """A plant with the declaration of `original`, whose parameters are `CounterfactualParams`.
+    """The plant with the declaration of `original` whose parameters are `CounterfactualParams`; the same each time.
 
     Each training episode is another view of one of the recorded ones. No longer than they are.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import chex
@@ -91,17 +91,20 @@ def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
             raise ValueError(f"plant {plant.name!r} has no number {name!r} to draw; it has: {', '.join(sorted(known))}")
         if not low <= high:
             raise ValueError(f"the range of {name} is {low:g} to {high:g}; the first must not be above the second")
+    return _drawing(plant, tuple((*known[name], *ends) for name, ends in named.items())), plant.widened(params, named)
+
+
+@cache
+def _drawing(plant: Plant, drawn: tuple[tuple[int, tuple[int, ...], float, float], ...]) -> Plant:
+    """The plant that draws these elements of these leaves; the same one each time, so that it is compiled once."""
 
     def draw(key: chex.PRNGKey, params: Any) -> Any:
         leaves, structure = jax.tree.flatten(params)
-        for share, (name, (low, high)) in zip(
-            jax.random.uniform(key, (len(named),), float), named.items(), strict=True
-        ):
-            leaf, element = known[name]
+        for share, (leaf, element, low, high) in zip(jax.random.uniform(key, (len(drawn),), float), drawn, strict=True):
             leaves[leaf] = leaves[leaf].at[element].set(low + (high - low) * share)
         return jax.tree.unflatten(structure, leaves)
 
-    return replace(plant, draw=draw), plant.widened(params, named)
+    return replace(plant, draw=draw)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -98,9 +100,9 @@ def test_epochs_of_one_length_are_compiled_once(filled):
     assert trainer.epoch._cache_size() == before
 
 
-@pytest.mark.parametrize("name", ["default", "paper"])
-def test_same_seed_twice_is_bit_equal_and_another_seed_is_not(name):
-    trainer, params = build(small(name=name))
+@pytest.mark.parametrize("config", [SMALL, small(name="paper")], ids=["default", "paper"])
+def test_same_seed_twice_is_bit_equal_and_another_seed_is_not(config):
+    trainer, params = build(config)
     first, second, other = (
         trainer.epoch(trainer.prefill(trainer.start(seed, params), params), params, 80)[0] for seed in (0, 0, 1)
     )
@@ -165,11 +167,11 @@ def test_a_plant_that_diverges_never_poisons_the_replay():
 
 
 @makes_nan
-def test_actions_that_are_not_finite_become_zero_and_are_counted():
-    trainer, params = build(small())
-    state = trainer.prefill(trainer.start(0, params), params)
+def test_actions_that_are_not_finite_become_zero_and_are_counted(filled):
+    trainer, params, state = filled
+    state = copy(state)
     actor = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.learner.actor)
-    state, metrics = trainer.epoch(state._replace(learner=state.learner._replace(actor=actor)), params, 160)
+    state, metrics = trainer.epoch(state._replace(learner=state.learner._replace(actor=actor)), params, 80)
     assert float(metrics["no_action"]) == float(metrics["skipped"]) == 1.0
     chex.assert_tree_all_finite((state.replay.rows, state.obs, state.env.y, state.learner.critics))
 
@@ -187,16 +189,21 @@ def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes():
     blind = trainer.diagnose(state._replace(learner=state.learner._replace(actor=actor, critics=critics)), params)
     assert float(blind["q_start"]) == 0.0
     key = jax.random.split(jax.random.fold_in(state.key, DIAGNOSIS), 3)[2]
-    gamma, returns = trainer.config.ddpg.discount, []
-    step = jax.jit(trainer.env.step_env)
-    for of_episode in jax.random.split(key, EPISODES):
-        of_reset, of_run = jax.random.split(of_episode)
+
+    @jax.jit
+    @jax.vmap
+    def rewards(key):
+        of_reset, of_run = jax.random.split(key)
         _, env = trainer.env.reset(of_reset, params)
-        rewards = []
-        for of_step in jax.random.split(of_run, trainer.env.plant.episode_steps):
-            _, env, reward, *_ = step(of_step, env, jnp.array(20.0), params)
-            rewards.append(float(reward))
-        returns.append(0.5 * np.sum(gamma ** np.arange(len(rewards)) * rewards))
+
+        def step(env, of_step):
+            _, env, reward, *_ = trainer.env.step_env(of_step, env, jnp.array(20.0), params)
+            return env, reward
+
+        return jax.lax.scan(step, env, jax.random.split(of_run, trainer.env.plant.episode_steps))[1]
+
+    each = np.asarray(rewards(jax.random.split(key, EPISODES)))
+    returns = 0.5 * each @ trainer.config.ddpg.discount ** np.arange(each.shape[1])
     assert float(blind["return_start"]) == pytest.approx(np.mean(returns), rel=1e-4)
 
 
@@ -210,7 +217,7 @@ def test_residual_starts_at_the_static_prefilter():
 
 def test_set_points_are_redrawn_within_an_episode_only_where_asked():
     for redraw, changes in ((0.0, False), (0.5, True)):
-        trainer, params = build(small(redraw=redraw))
+        trainer, params = build(replace(SMALL, redraw=redraw))
         rows = trainer.prefill(trainer.start(0, params), params).replay.rows[:, trainer.replay.mirror :][:, :80]
         r, age = rows[..., FIELDS.index("r")], rows[..., FIELDS.index("age")]
         within = (age[:, 1:] > 0) & (r[:, 1:] != r[:, :-1])
