@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# Lint, types and tests, those of plants and loop in double precision too, in under 12 minutes on 2 cores.
-# --all, under 80 minutes: also the slow tests, all others in double precision with checks for NaN, places broken on
-# purpose, 20 kills, the code blocks of the documentation, and stable-baselines3 on our environment (5 GB the first time,
-# see peers.sh). --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time
-# is in benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
+# Lint, types and tests, in under 9 minutes on 2 cores.
+# --all, under 120 minutes: also the slow tests, all others in double precision, all but plants and loop with checks for
+# NaN, places broken on purpose, 20 kills, the default suite on a second Python, the code blocks of the documentation, and
+# stable-baselines3 on our environment (5 GB the first time, see peers.sh).
+# --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time is in
+# benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 cd "$root"
 tests() { "$PYTHON" -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder "$@"; }
@@ -44,7 +45,6 @@ part() {  # TITLE COMMAND...: run it, and note its last line, minutes, commit an
 "$PYTHON" -m basedpyright --pythonpath "$PYTHON"
 if [ $# -eq 0 ]; then
     fast tests
-    in_double tests/plants tests/loop
 elif [ "$1" = --all ]; then
     only=${*:2}
     [ -e "$result" ] ||

@@ -28,6 +28,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_every_page_is_in_nav(site):
     nav = re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text())
     found = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
@@ -35,11 +36,13 @@ def test_every_page_is_in_nav(site):
     assert all((site / page).with_suffix(".html").is_file() for page in nav)
 
 
+@pytest.mark.slow
 def test_no_page_asks_the_network(site):
     for path in [*site.rglob("*.html"), *site.rglob("*.css")]:
         assert FROM_ELSEWHERE.findall(path.read_text()) == [], path
 
 
+@pytest.mark.slow
 def test_what_is_kept_elsewhere_is_shown(site):
     commands = (site / "reference" / "commands.html").read_text()
     assert all(f'id="{name}"' in commands for name in ("check", "compare", "evaluate", "export", "train"))

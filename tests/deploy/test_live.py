@@ -130,6 +130,7 @@ def test_the_replay_holds_what_happened(learned):
     np.testing.assert_allclose(kept["reward"][1:], -price / 2, atol=1e-5)
 
 
+@pytest.mark.slow
 @of_single_draws
 def test_it_learns_to_be_better_than_both(learned):
     loop, rows = ran(Live.of(*declared(DT, 200, OPTIONS), 500, "static"), 1600, learn=True, record=300, most_updates=4)

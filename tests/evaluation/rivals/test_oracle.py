@@ -50,6 +50,7 @@ def white(school, prior):
     return school.whitening(prior, lag.make()[1], KEY)
 
 
+@pytest.mark.slow
 def test_it_is_as_good_as_pi_and_mpc(tuned):
     """Within 2 % in return, on training episodes that none of them has seen."""
     plant, params = lag.make()
