@@ -18,6 +18,7 @@ import numpy as np
 from jaxouter.deploy.law import Law
 from jaxouter.deploy.live import Live, LiveState, declared
 from jaxouter.deploy.realtime import Loop, Row
+from jaxouter.loop.columns import read
 from jaxouter.loop.references import FAMILIES
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training import checkpoint
@@ -212,7 +213,7 @@ def reference(text: str, setpoint_range: tuple[float, float], steps: int, seed: 
         keys = jax.random.split(jax.random.key(seed), EPISODES)
         drawn = jax.vmap(lambda key: FAMILIES[text](key, steps, *setpoint_range))(keys)
         return np.asarray(drawn, np.float64).ravel()
-    cycle = _column(Path(text)) if text.lower().endswith(".csv") else _number(text)
+    cycle = read(Path(text), ("r",))[0] if text.lower().endswith(".csv") else _number(text)
     if not len(cycle) or not np.isfinite(cycle).all():
         raise ValueError(f"--reference is {text!r}; it must be finite numbers")
     return cycle
@@ -224,14 +225,6 @@ def _number(text: str) -> np.ndarray:
     except ValueError:
         forms = f"a number, a CSV file with a column r, or one of {', '.join(FAMILIES)}"
         raise ValueError(f"--reference is {text!r}; it must be {forms}") from None
-
-
-def _column(path: Path) -> np.ndarray:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return np.array([float(row["r"]) for row in csv.DictReader(file, skipinitialspace=True)])
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise ValueError(f"--reference is {path}, which has no readable column r of numbers ({error!r})") from None
 
 
 def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:

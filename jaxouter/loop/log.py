@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import lfilter, lfiltic
 
+from jaxouter.loop import columns
 from jaxouter.loop.identify import Record, fit_arx
 from jaxouter.plants import Plant, arx
 from jaxouter.plants.arx import Model
@@ -65,63 +64,16 @@ def read(path: str | Path) -> Log:
         ValueError: names the file, the row (of the data, from 1 on), and what is allowed.
     """
     path = Path(path)
-    readers = {".csv": _csv, ".parquet": _parquet}
-    if path.suffix.lower() not in readers:
-        raise ValueError(f"the log {path} is neither .csv nor .parquet")
+    if path.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"the log {path} is neither .csv nor .parquet; export it as CSV with {','.join(COLUMNS)}")
     if not path.is_file():
         raise ValueError(f"there is no log {path}")
-    log = Log(*readers[path.suffix.lower()](path))
+    log = Log(*columns.read(path, COLUMNS))
     try:
         _check(log)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return log
-
-
-def _csv(path: Path) -> list[np.ndarray]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            reader = csv.reader(file, skipinitialspace=True)
-            places = _places(path, [name.strip() for name in next(reader, [])])
-            rows = [[row[place] if place < len(row) else "" for place in places] for row in reader if row]
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is no CSV: {error}") from None
-    columns = [list(column) for column in zip(*rows, strict=True)] or [[]] * len(COLUMNS)
-    return [_floats(path, name, column) for name, column in zip(COLUMNS, columns, strict=True)]
-
-
-def _parquet(path: Path) -> list[np.ndarray]:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise ValueError(f"{path} takes pyarrow to read: pip install 'jaxouter[parquet]', or write it as CSV") from None
-    try:
-        table = parquet.read_table(path)
-    except pyarrow.ArrowInvalid as error:
-        raise ValueError(f"{path} is no Parquet: {error}") from None
-    places = _places(path, table.column_names)
-    return [_floats(path, name, table.column(at).to_pylist()) for name, at in zip(COLUMNS, places, strict=True)]
-
-
-def _places(path: Path, names: list[str]) -> list[int]:
-    for name in COLUMNS:
-        if names.count(name) != 1:
-            raise ValueError(
-                f"{path} has {names.count(name)} columns {name!r}; it must have one each of {', '.join(COLUMNS)}, "
-                f"and has: {', '.join(names)}"
-            )
-    return [names.index(name) for name in COLUMNS]
-
-
-def _floats(path: Path, name: str, column: Iterable[Any]) -> np.ndarray:
-    out = []
-    for row, value in enumerate(column, 1):
-        try:
-            out.append(float(value))
-        except (TypeError, ValueError):
-            raise ValueError(f"{path}: {name} in row {row} is {value!r}; it must be a number") from None
-    return np.array(out)
 
 
 def _check(log: Log) -> None:

@@ -72,8 +72,8 @@ def changed(column: str, row: int, value: object) -> str:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["0 columns 'time'", "time, r_tilde, y"]),
-        ("time,r,y\n0,1,2\n", ["0 columns 'r_tilde'", "and has: time, r, y"]),
+        ("", ["it is empty", "time,r_tilde,y"]),
+        ("time,r,y\n0,1,2\n", ["no column 'r_tilde' but 'r'", "and is time,r,y"]),
         ("time,r_tilde,y,y\n", ["2 columns 'y'"]),
         ("time,r_tilde,y\n", ["there are 0 rows", "at least 200"]),
         ("time,r_tilde,y\n0,1,2\n0.1,1,2\n", ["there are 2 rows", "at least 200"]),
@@ -100,7 +100,7 @@ def test_a_file_that_is_none_of_these_is_refused(tmp_path: Path) -> None:
         logs.read(tmp_path / "none.csv")
     with pytest.raises(ValueError, match=r"log\.xlsx is neither \.csv nor \.parquet"):
         logs.read("log.xlsx")
-    for name, words in (("log.parquet", "is no Parquet"), ("log.csv", "is no CSV")):
+    for name, words in (("log.parquet", "is no Parquet"), ("log.csv", "line 2 is no UTF-8")):
         (tmp_path / name).write_bytes(b"time,r_tilde,y\n\xff\xfe")
         with pytest.raises(ValueError, match=words):
             logs.read(tmp_path / name)
