@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -44,11 +45,15 @@ def write(path: Path, content: bytes | memoryview) -> None:
     except OSError:
         partial.unlink(missing_ok=True)  # what a full disk needs first
         raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # of the name
-    finally:
-        os.close(folder)
+    if os.name == "posix":  # elsewhere no folder can be opened
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # of the name
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that can't
+                raise
+        finally:
+            os.close(folder)
 
 
 def save(path: Path, tree: Any, **header: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import suppress
 from itertools import pairwise
@@ -92,13 +93,15 @@ def plan(config: TrainConfig) -> Plan:
     return Plan(lines, memory)
 
 
-def _there() -> int:
-    """Bytes of memory of the machine, or of the container where that has less."""
-    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+def _there() -> float:
+    """Bytes of memory of the machine, or of the container where that has less; inf where nothing tells it."""
+    limits = [math.inf]
+    with suppress(AttributeError, OSError, ValueError):  # Windows has no sysconf
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         with suppress(OSError, ValueError):  # there is none, or it is "max"
             limits.append(int(Path(path).read_text()))
-    return min(limits)
+    return min(limit for limit in limits if limit > 0)
 
 
 def update_mflop(config: DDPGConfig, observations: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import platform
@@ -11,7 +10,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from filelock import FileLock, Timeout
 
 import jaxouter
 from jaxouter.loop.environment import EnvParams
@@ -72,7 +72,7 @@ class Run:
             except OSError as error:
                 if made is not None:
                     shutil.rmtree(made, ignore_errors=True)
-                if error.errno == errno.ENOTEMPTY:  # made by another process meanwhile
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # made by another process meanwhile
                     continue
                 raise ValueError(f"the folder {path} can't be made: {error.strerror}") from None
             return cls(path, config)
@@ -104,23 +104,23 @@ class Run:
         Raises:
             ValueError: another process has it.
         """
-        with ExitStack() as stack:
-            path = self.path / "lock"
-            try:
-                file = stack.enter_context(path.open("a+"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                number = path.read_text().strip()
-                raise ValueError(
-                    f"{self.path} is being trained by process {number}; wait for its end, or stop it"
-                ) from None
-            except OSError as error:
-                raise ValueError(f"{self.path} can't be locked: {error.strerror}") from None
-            with suppress(OSError):  # on a full disk the number of the process is not told
-                file.truncate(0)
-                file.write(str(os.getpid()))
-                file.flush()
+        holder, lock = self.path / "process", FileLock(self.path / "lock", timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            number = holder.read_text().strip() if holder.exists() else "?"
+            raise ValueError(
+                f"{self.path} is being trained by process {number}; wait for its end, or stop it"
+            ) from None
+        except OSError as error:
+            raise ValueError(f"{self.path} can't be locked: {error.strerror}") from None
+        with suppress(OSError):  # on a full disk the number of the process is not told
+            holder.write_text(str(os.getpid()))
+        try:
             yield
+        finally:
+            holder.unlink(missing_ok=True)
+            lock.release()
 
     def changes(self) -> list[str]:
         """What the results depend on and is no longer what it was when the run was made."""

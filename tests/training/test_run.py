@@ -1,5 +1,8 @@
+import errno
 import json
+import math
 import os
+import stat
 from pathlib import Path
 
 import chex
@@ -8,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.training import checkpoint
+from jaxouter.training import checkpoint, plan
 from jaxouter.training.run import KEEP, Run, RunWarning
 from jaxouter.training.train import NotFiniteError, Pace, train
 from tests.precision import FLOAT, makes_nan
@@ -163,6 +166,26 @@ def test_a_folder_that_cannot_be_locked_or_made_is_refused(tmp_path):
         pass
     with pytest.raises(ValueError, match="can't be made: File name too long"):
         new_run(tmp_path / ("x" * 300))
+
+
+def test_a_file_system_that_does_not_sync_folders_will_do(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def of_files_alone(number: int) -> None:
+        if stat.S_ISDIR(os.fstat(number).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", of_files_alone)
+    checkpoint.write(tmp_path / "file", b"content")
+    assert (tmp_path / "file").read_bytes() == b"content"
+
+
+def test_memory_of_the_machine_is_unlimited_where_nothing_tells_it(monkeypatch):
+    assert 0 < plan._there() < 1e16
+    monkeypatch.delattr(os, "sysconf")
+    monkeypatch.setattr(Path, "read_text", lambda *_: "max")
+    assert plan._there() == math.inf
 
 
 @pytest.mark.parametrize("content", ["{}", "[" * 100_000, '{"median_seed": 7}'])
