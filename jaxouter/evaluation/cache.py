@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import tempfile
 import threading
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import platformdirs
 
 import jaxouter
 from jaxouter.plants import sources
@@ -33,9 +37,35 @@ class Tuned(NamedTuple):
     seconds: float = 0.0  # that it took when it was made; `cached` says
 
 
-def folder() -> Path:
-    """The user's cache folder of jaxouter."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxouter"
+def folder() -> Path | None:
+    """The user's cache folder of jaxouter; None where the user has none."""
+    try:
+        path = Path(platformdirs.user_cache_dir("jaxouter", appauthor=False))
+    except RuntimeError:
+        return None
+    return path if path.is_absolute() else None  # "~/.cache" of earlier versions
+
+
+def usable() -> Path | None:
+    """The cache folder, made, if files can be written there; warns once where not."""
+    return _usable(folder())
+
+
+@lru_cache(maxsize=4)
+def _usable(path: Path | None) -> Path | None:
+    if path is None:
+        return _unusable("there is no cache folder, for want of a home and of an absolute XDG_CACHE_HOME")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path) as file:
+            file.write(bytes(1 << 16))  # more than a full disk takes
+    except OSError as error:
+        return _unusable(f"the cache folder {path} can't be written ({error.strerror})")
+    return path
+
+
+def _unusable(why: str) -> None:
+    warnings.warn(f"{why}; nothing that is compiled or tuned is kept, and the next start takes as long", stacklevel=4)
 
 
 @lru_cache(maxsize=1)
@@ -56,24 +86,37 @@ def cached(name: str, key: Mapping[str, Any], make: Callable[[], Tuned]) -> Tune
     """
     own = {name: repr(source) for name, source in sources.SOURCES.items()}
     text = json.dumps({"code": code(), **key} | ({"plants": own} if own else {}), sort_keys=True)
-    path = folder() / "rivals" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            arrays = {name: file[name] for name in file.files if name != "header"}
-            return Tuned(arrays=arrays, **header)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        pass  # absent or damaged: made again
+    kept = Path("rivals") / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    if (there := folder()) is not None:
+        with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # absent or damaged: made again
+            return _read(there / kept)
     begin = time.perf_counter()
     made = make()
     made = made._replace(seconds=time.perf_counter() - begin)
-    partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"the cache folder {path.parent} can't be made: {error.strerror}") from None
-    with partial.open("wb") as file:
-        header = json.dumps({"settings": made.settings, "steps": made.steps, "seconds": made.seconds})
-        np.savez(file, allow_pickle=False, header=np.asarray(header), **made.arrays)
-    partial.replace(path)
+    if (there := usable()) is not None:
+        try:
+            _write(there / kept, made)
+        except OSError as error:
+            warnings.warn(
+                f"{there / kept} can't be written ({error.strerror}); it is made anew next time", stacklevel=2
+            )
     return made
+
+
+def _read(path: Path) -> Tuned:
+    with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        header = json.loads(str(file["header"]))
+        return Tuned(arrays={name: file[name] for name in file.files if name != "header"}, **header)
+
+
+def _write(path: Path, made: Tuned) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(exist_ok=True)
+    partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
+    header = json.dumps({"settings": made.settings, "steps": made.steps, "seconds": made.seconds})
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, header=np.asarray(header), **made.arrays)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

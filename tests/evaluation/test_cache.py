@@ -1,11 +1,17 @@
+import errno
 import multiprocessing
+import os
+import re
 import shutil
+import sys
+import tempfile
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 import pytest
 
 from jaxouter.evaluation import cache
@@ -73,6 +79,8 @@ def test_folder_is_the_users_own(tmp_path, monkeypatch):
     assert cache.folder() == tmp_path / "jaxouter"
     for unset in (lambda: monkeypatch.setenv("XDG_CACHE_HOME", ""), lambda: monkeypatch.delenv("XDG_CACHE_HOME")):
         unset()
+        assert cache.folder() == Path(platformdirs.user_cache_path("jaxouter", appauthor=False))
+    if sys.platform == "linux":
         assert cache.folder() == Path.home() / ".cache" / "jaxouter"
 
 
@@ -102,11 +110,33 @@ def test_time_that_it_took_is_kept():
     assert cache.cached("pitch-pi", KEY, never).seconds == made.seconds
 
 
-def test_folder_that_cannot_be_made_is_named(tmp_path, monkeypatch):
+def full(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        ("a file in its place", "can't be written (Not a directory); nothing that is compiled or tuned is kept"),
+        ("no home", "there is no cache folder"),
+        ("full", "can't be written (No space left on device); nothing"),
+        ("full meanwhile", "can't be written (No space left on device); it is made anew next time"),
+    ],
+)
+def test_without_a_folder_the_result_is_there_all_the_same_and_it_is_said_once(tmp_path, monkeypatch, trouble, words):
     (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(ValueError, match="rivals can't be made: Not a directory"):
-        cache.cached("pitch-pi", KEY, Maker())
+    if trouble == "a file in its place":
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    elif trouble == "no home":
+        monkeypatch.setattr(cache, "folder", lambda: None)
+        cache._usable.cache_clear()
+    else:
+        monkeypatch.setattr(*((tempfile, "TemporaryFile") if trouble == "full" else (np, "savez")), full)
+    with pytest.warns(UserWarning, match=re.escape(words)):
+        assert_equal(cache.cached("pitch-pi", KEY, Maker()), TUNED)
+    if trouble != "full meanwhile":  # which may be over
+        assert_equal(cache.cached("pitch-pi", KEY, Maker()), TUNED)
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"file"}
 
 
 def test_nothing_is_pickled():
