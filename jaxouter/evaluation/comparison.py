@@ -8,11 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 
+from jaxouter.evaluation.drawing import Axes, Figure, Line2D, LogNorm, SubFigure
 from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, symbol, times
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
