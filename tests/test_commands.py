@@ -17,7 +17,7 @@ from jaxouter import evaluate, train
 from jaxouter.plants import REGISTRY
 from jaxouter.training.config import to_dict
 from jaxouter.training.run import Run
-from tests import lag
+from tests import interrupts, lag
 from tests.precision import of_single_draws
 from tests.training.small import small
 
@@ -211,13 +211,14 @@ def test_run_of_one_plant_is_not_evaluated_on_another(trained, capsys):
 
 def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
     long = ["--steps", "400640", "--epoch", "4000", "--out", "run"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxouter.train", "heaters", *SMALL, *long],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    with interrupts.heard():
+        process = subprocess.Popen(
+            [sys.executable, "-m", "jaxouter.train", "heaters", *SMALL, *long],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     metrics = tmp_path / "run" / "seed-0" / "metrics.jsonl"
     deadline = time.monotonic() + 200
     while not (metrics.exists() and metrics.read_text()) and time.monotonic() < deadline:

@@ -21,7 +21,7 @@ from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants import REGISTRY
 from jaxouter.training.run import Run, write_json
-from tests import lag
+from tests import interrupts, lag
 from tests.training.small import small
 
 LEAD = Path(__file__).parents[1] / "scripts" / "examples" / "lead.py"
@@ -322,14 +322,15 @@ def test_what_is_named_twice_counts_once_and_files_of_one_name_are_told_apart(ru
 
 def test_ctrl_c_ends_it_with_130_and_leaves_nothing(tmp_path):
     """As a terminal sends it, to all processes of the group."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxouter.compare", *ASKED, "--policy", "pi", "mpc", "--out", "out"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    with interrupts.heard():
+        process = subprocess.Popen(
+            [sys.executable, "-m", "jaxouter.compare", *ASKED, "--policy", "pi", "mpc", "--out", "out"],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
     assert process.stdout is not None
     process.stdout.readline()  # the jobs have begun
     os.killpg(process.pid, signal.SIGINT)

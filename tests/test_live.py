@@ -15,6 +15,7 @@ from jaxouter import live
 from jaxouter.deploy.law import Law
 from jaxouter.loop.log import read
 from jaxouter.training.run import Run
+from tests import interrupts
 from tests.load import ROOT
 from tests.training.small import small
 
@@ -24,7 +25,8 @@ NOTHING = ["--learn", "--r-tilde-bounds", "0", "10", "--setpoint-range", "2", "6
 
 def start(*arguments: str, cwd) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "jaxouter.live", *arguments]
-    return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with interrupts.heard():
+        return subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.fixture(scope="module")

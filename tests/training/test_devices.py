@@ -18,6 +18,7 @@ from jaxouter.agents.ddpg import DDPG, Batch, DDPGConfig
 from jaxouter.train import parse
 from jaxouter.training.devices import Processes
 from jaxouter.training.run import Run
+from tests import interrupts
 from tests.precision import of_single_draws
 from tests.training.small import small
 
@@ -83,16 +84,17 @@ def test_resumption_takes_the_devices_of_the_run_unless_told(tmp_path):
 @contextmanager
 def started(folder: Path, *options: list[str]) -> Iterator[list[subprocess.Popen[str]]]:
     """The command in one process for each list of options; none of them outlives the block."""
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "jaxouter.train", *each],
-            cwd=folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for each in options
-    ]
+    with interrupts.heard():
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-m", "jaxouter.train", *each],
+                cwd=folder,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            for each in options
+        ]
     try:
         yield processes
     finally:
