@@ -55,22 +55,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
             picture = log_report(plant, options.plant.partition(":")[2], figure)
         else:
             picture = response_report(plant, params, figure)
-    print(f"figure: {picture}")
+    if picture is not None:
+        print(f"figure: {picture}")
     if any(wrong for _, wrong in found):
         raise SystemExit(1)
 
 
-def log_report(plant: Plant, path: str, figure: Path) -> Path:
+def log_report(plant: Plant, path: str, figure: Path) -> Path | None:
     """How far the log of this plant can be trusted, told and drawn."""
     told = trust.report(*log.identified(path))
     rows = [list(row) for row in trust.table(told, plant.y_unit, plant.time_unit)]
     cli.table(f"{plant.name}: how far the log can be trusted", ["what", "is"], rows)
     for warning in told.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
+    with cli.optional("figure"):
+        return figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
 
 
-def response_report(plant: Plant, params: object, figure: Path) -> Path:
+def response_report(plant: Plant, params: object, figure: Path) -> Path | None:
     """How the plant responds to r~, told and drawn."""
     gain, offset = identify.dc_gain(plant, params, jax.random.key(0))
     moves, responses = step_responses(plant, params)
@@ -84,7 +86,8 @@ def response_report(plant: Plant, params: object, figure: Path) -> Path:
     cli.table(f"{plant.name}: how it responds", ["what", "is"], [list(line) for line in lines])
     if reached[0] > plant.setpoint_range[0] or reached[1] < plant.setpoint_range[1]:
         print("warning: no r~ within its bounds holds y at every set-point", file=sys.stderr)
-    return figures.step_responses(figure, plant, moves, responses)
+    with cli.optional("figure"):
+        return figures.step_responses(figure, plant, moves, responses)
 
 
 def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import functools
 import glob
+import os
 import re
 import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
 import jax
 from rich.console import Console
@@ -27,7 +31,19 @@ from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.training.config import OWN, PRESETS, TrainConfig
 from jaxouter.training.run import RunWarning
 
-console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
+
+def on_terminal() -> bool:
+    """Whether what is printed is seen at once; there may be no standard output, or one of another kind."""
+    try:
+        return sys.stdout.isatty()
+    except (AttributeError, ValueError):
+        return False
+
+
+console = Console(
+    width=None if on_terminal() else 140,  # a file is not cut to 80 columns
+    force_terminal=False if os.environ.get("TERM") in ("dumb", "unknown") else None,  # plain lines, no bars
+)
 LINE_SECONDS = 5.0  # between two plain lines of progress
 
 
@@ -38,9 +54,38 @@ def user_errors() -> Iterator[None]:
     warnings.showwarning = show
     try:
         yield
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except Exception as error:
+        message = missing_backend() or (str(error) if isinstance(error, ValueError) else None)
+        if message is None:
+            raise
+        print(f"error: {message}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def missing_backend() -> str | None:
+    """What JAX is told to run on and does not find, and what there is; JAX raises all kinds of errors then."""
+    for variable in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        asked = jax.config.values[variable.lower()]
+        if asked and asked != "cpu":
+            try:
+                for name in asked.split(","):
+                    jax.devices(name)
+            except Exception:
+                jax.config.update(variable.lower(), None)
+                there = ",".join(sorted({device.platform for device in jax.devices()}))
+                return (
+                    f"{variable} is {asked!r}, which is not all there; there is {there}: unset it, or set it to {there}"
+                )
+    return None
+
+
+@contextmanager
+def optional(what: str) -> Iterator[None]:
+    """What fails in here ends nothing: a line says what there is none of."""
+    try:
+        yield
+    except Exception as error:  # whatever a library raises
+        print(f"warning: no {what}: {type(error).__name__}: {str(error).partition(chr(10))[0]}", file=sys.stderr)
 
 
 def show(message: Warning | str, *_: object) -> None:
@@ -48,35 +93,94 @@ def show(message: Warning | str, *_: object) -> None:
 
     JAX compiles then, but writes no entry where there is one: it is removed, else later processes would compile too.
     """
-    half = re.match("Error reading persistent compilation cache entry for '(.+?)'", str(message))
-    if half is None:
-        print(f"warning: {message}", file=sys.stderr)
+    text, folder = str(message), jax.config.values["jax_compilation_cache_dir"]
+    half = re.match("Error reading persistent compilation cache entry for '(.+?)'", text)
+    if text.startswith("Error writing persistent compilation cache entry"):
+        _not_kept(folder)
+    elif half is None:
+        print(f"warning: {text}", file=sys.stderr)
     else:
-        for entry in Path(jax.config.values["jax_compilation_cache_dir"]).glob(f"{glob.escape(half[1])}-*-cache"):
-            entry.unlink(missing_ok=True)
+        with suppress(OSError):
+            for entry in Path(folder).glob(f"{glob.escape(half[1])}-*-cache"):
+                entry.unlink(missing_ok=True)
+
+
+@functools.cache
+def _not_kept(folder: str) -> None:
+    print(f"warning: {folder} can't be written: functions are compiled anew at the next start", file=sys.stderr)
+
+
+class Lasting:
+    """An output stream whose end is not that of the work: a pipe nobody reads, a full disk, a terminal that is gone."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, or drop."""
+        with self._lasting():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop."""
+        with self._lasting():
+            self._stream.flush()
+
+    @contextmanager
+    def _lasting(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            with open(os.devnull, "wb") as nothing:
+                os.dup2(nothing.fileno(), self._stream.fileno())  # with what waits to be written
+            if self is sys.stdout and error.errno != errno.EPIPE:  # who closes a pipe knows
+                print(f"warning: the output can't be written ({error.strerror}); going on without", file=sys.stderr)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def last() -> None:
+    """Let the streams of this process outlast what they are connected with; signs that they don't know become '?'."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115 - as long as the process
+        if not isinstance(stream, Lasting):
+            stream.reconfigure(errors="replace")
+            setattr(sys, name, Lasting(stream))
 
 
 def run(main: Callable[[], None]) -> None:
-    """The command as a program: Ctrl-C, where nothing else handles it, ends it quietly with status 130."""
+    """The command as a program: Ctrl-C, where nothing else handles it, ends it quietly with status 130.
+
+    A file that can't be read or written is told in one line, with status 1.
+    """
+    last()
     try:
         main()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+    except OSError as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 def use_compilation_cache() -> None:
     """Keep compiled functions in the user's cache folder, unless JAX is told otherwise."""
-    if not jax.config.values["jax_compilation_cache_dir"]:
-        jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "xla"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
     warnings.showwarning = show
+    if not jax.config.values["jax_compilation_cache_dir"] and (folder := cache.usable()) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
 
 
 def use_plants(sources: Iterable[Source]) -> None:
     """What a process of its own begins with: the plants that its parent knows, and the compilation cache."""
+    last()
     for source in sources:
         add(source.reference, source.options)
-    use_compilation_cache()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the parent has said what there is to say of the cache
+        use_compilation_cache()
+    warnings.showwarning = show
 
 
 def print_lists() -> None:
@@ -99,8 +203,11 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         self._before: dict[int, Any] = {}
+        if threading.current_thread() is not threading.main_thread():
+            return self  # Python hands signals to the main thread alone
         for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._handle)
+            if signal.getsignal(number) != signal.SIG_IGN:  # what a shell runs in its background stays deaf
+                self._before[number] = signal.signal(number, self._handle)
         return self
 
     def _handle(self, number: int, frame: Any) -> None:

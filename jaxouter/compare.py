@@ -89,8 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "seconds": time.perf_counter() - begun,
         "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
     }
-    page = write(plan, content, done)
     show(content)
+    page = write(plan, content, done)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
 
 
@@ -215,19 +215,22 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
     """comparison.json, comparison.csv, figures and the report; returns the report's path."""
     rows = content["rows"]
     write_json(plan.out / "comparison.json", content)
-    with (plan.out / "comparison.csv").open("w", newline="") as file:
+    with (plan.out / "comparison.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         table.writeheader()
         table.writerows(rows)
-    figures, responses = comparison.draw(plan.out / "figures", content), {}
+    figures: dict[str, Path] = {}
+    responses: dict[str, Path] = {}
     lines = statistics.lines(rows, content["policies"])
     label = {(line.policy, line.run): line.label for line in lines}
-    for name in plan.scenarios:
-        traces = {label[c.line]: t for c, t in board.first_episodes(done, name).items()}
-        traces = {line.label: traces[line.label] for line in lines}
-        path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
-        scenario = scenarios.get(name, family_seed=plan.family_seed)
-        responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
+    with cli.optional("figures"):
+        figures |= comparison.draw(plan.out / "figures", content)
+        for name in plan.scenarios:
+            traces = {label[c.line]: t for c, t in board.first_episodes(done, name).items()}
+            traces = {line.label: traces[line.label] for line in lines}
+            path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
+            scenario = scenarios.get(name, family_seed=plan.family_seed)
+            responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
     return report.write(plan.out / "report.html", content, figures, responses)
 
 

@@ -162,7 +162,6 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     found = summary(loop, columns)
     write_json(folder.path / "summary.json", found)
     unit = loop.live.trainer.env.plant.y_unit
-    figure = figures.live(folder.path / "live.png", columns, unit)
     cli.table(
         "MAE: of y, and of what it would have been on the same steps",
         ["", "y", "had r passed", KEPT[loop.live.kept], "learned"],
@@ -174,7 +173,9 @@ def report(folder: LiveFolder, loop: Loop) -> None:
         f"{found['steps']:,} steps ({passed}); {found['missed_deadlines']:,} missed deadlines; {found['updates']:,} "
         f"updates; act takes {act['p50']:.0f} us (p50), {act['p99']:.0f} us (p99)"
     )
-    print(f"figure: {figure}; summary, steps.csv and controller.npz beside it")
+    with cli.optional("figure"):
+        print(f"figure: {figures.live(folder.path / 'live.png', columns, unit)}")
+    print(f"summary, steps.csv and controller.npz: {folder.path}")
 
 
 if __name__ == "__main__":

@@ -104,8 +104,9 @@ def main(arguments: list[str] | None = None) -> None:
         cli.use_compilation_cache()
         config = options.config.check()
         if options.dry_run:
+            lines = plan(config).lines
             print(json.dumps(to_dict(config), indent=2))
-            return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], plan(config).lines)
+            return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], lines)
         if options.tensorboard:
             tensorboard.require()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
@@ -173,7 +174,6 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     learned = {seed: evaluate(named, met, record_members=True) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
-    main_figure = draw(run, met, simple_results, learned[median])
     summary = {
         "format": FORMAT,
         "median_seed": median,
@@ -188,7 +188,10 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned, places if run.config.randomise else {})
-    print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
+    main_figure = ""
+    with cli.optional("figures"):
+        main_figure = f", main figure {draw(run, met, simple_results, learned[median])}"
+    print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}{main_figure}")
 
 
 def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results) -> Path:

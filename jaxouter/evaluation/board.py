@@ -9,12 +9,15 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -183,6 +186,7 @@ class _Worker:
     @classmethod
     def begin(cls, messages: Any, initialise: Callable[[], None]) -> None:
         cls.messages = messages
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone
         threading.Thread(target=cls.end_with_parent, daemon=True).start()
         initialise()
 
@@ -198,6 +202,25 @@ class _Worker:
         return run(job, lambda text: cls.messages.put(f"{job}: {text}"))
 
 
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Processes that start in here are deaf to Ctrl-C from the first, and don't run the script of this one again.
+
+    That script, or notebook, holds nothing that they need, and they need not be guarded against.
+    """
+    main, handler = sys.modules["__main__"], None
+    sys.modules["__main__"] = ModuleType("__main__")
+    in_main_thread = threading.current_thread() is threading.main_thread()  # the one that may set it
+    if in_main_thread:
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        if in_main_thread:
+            signal.signal(signal.SIGINT, handler)
+
+
 def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) -> Iterator[Done]:
     """The jobs as they get done: on a CPU in a process a core, on an accelerator one after the other.
 
@@ -207,18 +230,18 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
         report: told now and then how far they are.
     """
     cores = os.cpu_count() or 1
-    if jax.default_backend() != "cpu" or cores == 1 or len(work) == 1:
+    alone = cores == 1 or len(work) == 1 or multiprocessing.current_process().daemon  # which may have no children
+    if jax.default_backend() != "cpu" or alone:
         for job in work:
             yield run(job, lambda text, job=job: report(f"{job}: {text}"))
         return
     context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
     messages = context.SimpleQueue()
     with ProcessPoolExecutor(min(cores, len(work)), context, _Worker.begin, (messages, initialise)) as pool:
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: Ctrl-C is for this process alone
         identifying = {job.contender for job in work if job.what == "identify"}
         free = [job for job in work if job.what == "identify" or job.contender not in identifying]
-        waiting = {pool.submit(_Worker.run, job) for job in free}
-        signal.signal(signal.SIGINT, handler)
+        with _starting():
+            waiting = {pool.submit(_Worker.run, job) for job in free}
         try:
             while waiting:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
@@ -228,7 +251,8 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
                     finished = future.result()
                     if finished.job.what == "identify":
                         freed = (job for job in work if job.contender == finished.job.contender and job != finished.job)
-                        waiting |= {pool.submit(_Worker.run, job) for job in freed}
+                        with _starting():
+                            waiting |= {pool.submit(_Worker.run, job) for job in freed}
                     yield finished
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
