@@ -7,6 +7,7 @@ import functools
 import glob
 import os
 import re
+import shutil
 import signal
 import sys
 import threading
@@ -31,6 +32,9 @@ from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.training.config import OWN, PRESETS, TrainConfig
 from jaxouter.training.run import RunWarning
 
+LINE_SECONDS = 5.0  # between two plain lines of progress
+NARROWEST = 20  # columns
+
 
 def on_terminal() -> bool:
     """Whether what is printed is seen at once; there may be no standard output, or one of another kind."""
@@ -40,11 +44,18 @@ def on_terminal() -> bool:
         return False
 
 
+def set_columns() -> None:
+    """What is narrower than any text counts as 20 columns: rich prints nothing in 0, tyro's help never ends in 1."""
+    columns = shutil.get_terminal_size().columns
+    if "COLUMNS" in os.environ or columns < NARROWEST:
+        os.environ["COLUMNS"] = str(max(columns, NARROWEST))
+
+
+set_columns()
 console = Console(
     width=None if on_terminal() else 140,  # a file is not cut to 80 columns
     force_terminal=False if os.environ.get("TERM") in ("dumb", "unknown") else None,  # plain lines, no bars
 )
-LINE_SECONDS = 5.0  # between two plain lines of progress
 
 
 @contextmanager

@@ -252,6 +252,14 @@ def test_a_compilation_cache_that_cannot_be_written_is_said_once(capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.parametrize(("given", "found"), [("0", 80), ("1", 20), ("20", 20), ("-5", 80), ("wide", 80), ("200", 200)])
+def test_columns_are_as_many_as_text_needs(monkeypatch, given, found):
+    monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setenv("COLUMNS", given)
+    cli.set_columns()
+    assert os.environ["COLUMNS"] == str(found)
+
+
 @pytest.mark.parametrize("width", [1, 20])
 def test_a_narrow_terminal_has_room_for_every_table(width, monkeypatch):
     out = io.StringIO()
