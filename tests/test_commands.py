@@ -255,12 +255,22 @@ def test_metrics_are_tensorboard_events_too(trained):
         assert sorted(found) == sorted(expected)
 
 
-def test_resume_of_a_finished_run_only_shows_it_again(trained, capsys):
+def test_resume_of_a_finished_run_only_shows_it_again_also_where_nothing_can_be_drawn(trained, capsys, monkeypatch):
+    def draw(*_: object) -> None:
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr(train, "draw", draw)
     _, folder = trained
     before = (folder / "seed-3" / "metrics.jsonl").read_text()
+    summary = (folder / "summary.json").read_text()
+    (folder / "summary.json").unlink()
     train.main(["--resume", str(folder)])
-    assert "pitch/delay-swapped" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "pitch/delay-swapped" in shown.out
+    assert shown.out.endswith(f"s in all; run folder {folder}\n")
+    assert "warning: no figures: RuntimeError: no fonts\n" in shown.err
     assert (folder / "seed-3" / "metrics.jsonl").read_text() == before
+    assert json.loads((folder / "summary.json").read_text()) == json.loads(summary)
 
 
 @pytest.mark.slow

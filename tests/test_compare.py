@@ -185,6 +185,17 @@ def test_rivals_come_from_the_cache_the_second_time(compared, tmp_path, monkeypa
     assert compare.folder(None, "pitch") == Path("runs/compare-pitch-2")
 
 
+def test_where_nothing_can_be_drawn_all_else_is_written(compared, tmp_path, capsys, monkeypatch):
+    def draw(*_: object) -> None:
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr(compare.comparison, "draw", draw)
+    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), compared.content, [])
+    assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
+    assert "outer loops compared" in page.read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "comparison.json").read_text()) == compared.content
+
+
 def test_existing_folder_is_refused_and_left_alone(compared, capsys, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in compared.out.rglob("*")}
     monkeypatch.chdir(compared.out.parents[1])

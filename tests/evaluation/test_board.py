@@ -1,5 +1,11 @@
+import multiprocessing
 import os
+import signal
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
 import jax
 import numpy as np
@@ -438,6 +444,31 @@ def test_processes_do_what_one_does_and_hand_on_what_fails(monkeypatch, tmp_path
         assert spread[job].found.steps == alone.found.steps
         assert_same_trees(spread[job].found.arrays, alone.found.arrays)
         assert spread[job].seconds > 0
+
+
+@pytest.mark.parametrize("in_thread", [False, True])
+def test_processes_do_not_run_the_script_again_that_starts_them_and_are_deaf_to_ctrl_c(
+    tmp_path, monkeypatch, in_thread
+):
+    script = ModuleType("__main__")
+    script.__file__ = str(tmp_path / "unguarded.py")
+    (tmp_path / "unguarded.py").write_text("1 / 0")
+    monkeypatch.setitem(sys.modules, "__main__", script)
+    before = signal.getsignal(signal.SIGINT)
+
+    def started() -> Any:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            with board._starting():
+                future = pool.submit(signal.getsignal, signal.SIGINT)
+            return future.result(100)
+
+    if in_thread:
+        with ThreadPoolExecutor(1) as threads:
+            threads.submit(started).result()
+    else:
+        assert started() == signal.SIG_IGN
+    assert sys.modules["__main__"] is script
+    assert signal.getsignal(signal.SIGINT) == before
 
 
 def test_one_job_needs_no_other_process(own):
