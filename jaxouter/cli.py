@@ -84,9 +84,7 @@ def missing_backend() -> str | None:
             except Exception:
                 jax.config.update(variable.lower(), None)
                 there = ",".join(sorted({device.platform for device in jax.devices()}))
-                return (
-                    f"{variable} is {asked!r}, which is not all there; there is {there}: unset it, or set it to {there}"
-                )
+                return f"{variable} is {asked!r}, but JAX finds only {there}: unset it, or set {variable}={there}"
     return None
 
 

@@ -128,7 +128,7 @@ def test_a_device_that_is_not_there_is_said_before_anything_else(elsewhere):
     done, folder = elsewhere
     assert done.returncode == 0, done.stderr
     names = ("cuda", "nonsense", "tpu", "cuda", "cpu,nonsense", "tpu")
-    text = "error: JAX_PLATFORMS is '{}', which is not all there; there is cpu: unset it, or set it to cpu"
+    text = "error: JAX_PLATFORMS is '{}', but JAX finds only cpu: unset it, or set JAX_PLATFORMS=cpu"
     assert [line for line in done.stderr.splitlines() if "error" in line] == [text.format(name) for name in names]
     assert "Traceback" not in done.stderr
     assert done.stdout == "imported\n"
