@@ -119,7 +119,6 @@ class Run:
         try:
             yield
         finally:
-            holder.unlink(missing_ok=True)
             lock.release()
 
     def changes(self) -> list[str]:
