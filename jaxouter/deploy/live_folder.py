@@ -213,7 +213,7 @@ def reference(text: str, setpoint_range: tuple[float, float], steps: int, seed: 
         keys = jax.random.split(jax.random.key(seed), EPISODES)
         drawn = jax.vmap(lambda key: FAMILIES[text](key, steps, *setpoint_range))(keys)
         return np.asarray(drawn, np.float64).ravel()
-    cycle = read(Path(text), ("r",))[0] if text.lower().endswith(".csv") else _number(text)
+    cycle = _column(Path(text)) if text.lower().endswith(".csv") else _number(text)
     if not len(cycle) or not np.isfinite(cycle).all():
         raise ValueError(f"--reference is {text!r}; it must be finite numbers")
     return cycle
@@ -225,6 +225,13 @@ def _number(text: str) -> np.ndarray:
     except ValueError:
         forms = f"a number, a CSV file with a column r, or one of {', '.join(FAMILIES)}"
         raise ValueError(f"--reference is {text!r}; it must be {forms}") from None
+
+
+def _column(path: Path) -> np.ndarray:
+    try:
+        return read(path, ("r",))[0]
+    except ValueError as error:
+        raise ValueError(f"--reference: {error}") from None
 
 
 def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
