@@ -6,9 +6,8 @@ import glob
 import re
 import signal
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +15,6 @@ from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from jaxouter import plants
@@ -24,11 +22,11 @@ from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants.sources import FORMS, Source, add
-from jaxouter.training.config import OWN, PRESETS, TrainConfig
+from jaxouter.progress import Progress
+from jaxouter.training.config import OWN, PRESETS
 from jaxouter.training.run import RunWarning
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
-LINE_SECONDS = 5.0  # between two plain lines of progress
 
 
 @contextmanager
@@ -90,6 +88,11 @@ def print_lists() -> None:
     console.print("policies: a run folder, " + ", ".join(NAMES))
 
 
+def progress(shown: bool = True) -> Progress:
+    """Progress on the console of the commands; not shown in processes but the first."""
+    return Progress(console, shown)
+
+
 class Interrupt:
     """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can save itself; the second one ends it at once."""
 
@@ -114,134 +117,6 @@ class Interrupt:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-
-
-class TrainingProgress:
-    """A live bar for each seed on a terminal, plain lines elsewhere."""
-
-    def __init__(self, config: TrainConfig, unit: str) -> None:
-        self._config, self._unit = config, unit
-        self._bars = Progress(
-            TextColumn("seed {task.fields[seed]}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._tasks: dict[int, Any] = {}
-        self._begin = self._last = time.monotonic()
-        self._first: int | None = None
-
-    def __enter__(self) -> TrainingProgress:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
-        """Show the row of an epoch."""
-        cfg, epoch, now = self._config, row["epoch"], time.monotonic()
-        if epoch == 0:
-            return self._show(seed, f"pretrained  MAE {number(row['mae'])} {self._unit}")
-        text = (
-            f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
-            f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {number(row['mae'])} {self._unit}"
-        )
-        if row.get("skipped", 0) or row.get("no_action", 0):
-            text += f"  {row['skipped']:.1%} of the updates skipped, {row['no_action']:.1%} of the actions not finite"
-        if console.is_terminal:
-            if seed not in self._tasks:
-                self._tasks[seed] = self._bars.add_task("", total=cfg.epochs, seed=seed, text="")
-            self._bars.update(self._tasks[seed], completed=epoch, text=text)
-        elif epoch == cfg.epochs or now - self._last >= LINE_SECONDS:
-            self._first = epoch - 1 if self._first is None else self._first
-            left = (now - self._begin) / max(1, epoch - self._first) * (cfg.epochs - epoch)
-            print(f"seed {seed}  epoch {epoch}/{cfg.epochs}  {text}  {left:.0f} s left", flush=True)
-            self._last = now
-
-    def pretrained(self, seed: int, done: int) -> None:
-        """Show how many gradient steps of the start are done."""
-        now = time.monotonic()
-        if console.is_terminal or now - self._last >= LINE_SECONDS:
-            self._show(seed, f"pretraining: {done:,} of {self._config.pretraining.gradient_steps:,} gradient steps")
-            self._last = now
-
-    def _show(self, seed: int, text: str) -> None:
-        if not console.is_terminal:
-            print(f"seed {seed}  {text}", flush=True)
-            return
-        if seed not in self._tasks:
-            self._tasks[seed] = self._bars.add_task("", total=self._config.epochs, seed=seed, text="")
-        self._bars.update(self._tasks[seed], text=text)
-
-
-class JobProgress:
-    """A live bar over many jobs on a terminal, plain lines elsewhere; on both what a long one says meanwhile."""
-
-    def __init__(self, total: int) -> None:
-        self._bar = Progress(
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("", total=total)
-        self._done, self._total, self._last = 0, total, time.monotonic()
-
-    def __enter__(self) -> JobProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def say(self, text: str) -> None:
-        """What one of the jobs is at."""
-        self._bar.update(self._task, description=text)
-        if not console.is_terminal and time.monotonic() - self._last >= LINE_SECONDS:
-            print(f"{self._done}/{self._total} jobs  {text}", flush=True)
-            self._last = time.monotonic()
-
-    def advance(self, text: str) -> None:
-        """One more is done."""
-        self._done += 1
-        self._bar.advance(self._task)
-        self.say(text)
-
-
-class Ticker:
-    """What goes on, in one line: live on a terminal, now and then elsewhere."""
-
-    def __init__(self) -> None:
-        self._status = console.status("")
-        self._seconds = 0.5 if console.is_terminal else LINE_SECONDS
-        self._last = time.monotonic()
-
-    def __enter__(self) -> Ticker:
-        if console.is_terminal:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._status.stop()
-
-    @property
-    def due(self) -> bool:
-        """Whether it is time to say something."""
-        return time.monotonic() - self._last >= self._seconds
-
-    def __call__(self, text: str) -> None:
-        """Say it."""
-        self._last = time.monotonic()
-        if console.is_terminal:
-            self._status.update(text)
-        else:
-            print(text, flush=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

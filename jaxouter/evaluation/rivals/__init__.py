@@ -72,7 +72,7 @@ BUDGET = 128_000  # environment steps that identification and tuning of a rival 
 SIMPLE = ("none", "static")  # what costs next to nothing
 
 
-def identified(name: str, plant_name: str, report: Report = lambda text: None) -> Tuned:
+def identified(name: str, plant_name: str, report: Report = lambda text, share: None) -> Tuned:
     """What identification and tuning of a rival found on the nominal plant, once for all: it is kept in the cache.
 
     Raises:
