@@ -23,7 +23,6 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.plants import Plant
 from jaxouter.plants.sources import add
 from jaxouter.progress import Progress, clock
 from jaxouter.training import devices, tensorboard
@@ -160,7 +159,7 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
         traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
         return {"mae": mae(traces)}
 
-    shown = Learning(progress, config, watched.plant, flop)
+    shown = Learning(progress, config, watched, flop)
     with cli.Interrupt() as interrupt, closing(tensorboard.Events(run)) as events:
 
         def heard(seed: int, row: Row) -> None:
@@ -178,13 +177,15 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
 class Learning:
     """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
 
-    def __init__(self, progress: Progress, config: TrainConfig, plant: Plant, flop: tuple[float, float]) -> None:
-        """Args: flop: of a gradient step of the pretraining, and of an update."""
-        self._progress, self._config, self._plant = progress, config, plant
+    def __init__(
+        self, progress: Progress, config: TrainConfig, watched: scenarios.Scenario, flop: tuple[float, float]
+    ) -> None:
+        """Args: watched: what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
+        self._progress, self._config, self._watched = progress, config, watched
         start, updates = config.pretraining.gradient_steps, config.total_updates
         self._gradient_steps, self._weights = config.seeds * (start + updates), flop
         self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))
-        self._done = dict.fromkeys(range(config.seed, config.seed + config.seeds), (0, 0))
+        self._done: dict[int, tuple[int, int]] = dict.fromkeys(range(config.seed, config.seed + config.seeds), (0, 0))
         self._maes: dict[int, str] = {}
         self._pace, self._what, self._begun = Pace(LOOK_SECONDS), "compiling", time.monotonic()
         progress.phase(self._what, self._work)
@@ -198,7 +199,7 @@ class Learning:
 
     def pretrained(self, seed: int, at: Rehearsal, look: Callable[[], Row]) -> None:
         """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
-        if self._plant.differentiable:
+        if self._watched.plant.differentiable:
             if self._pace.due():
                 self._maes[seed] = f"{self._pace.do(look)['mae']:.4g}"
         elif math.isfinite(at.best):
@@ -213,10 +214,10 @@ class Learning:
         self._progress.say(cost="")
         self._reached(seed, self._config.pretraining.gradient_steps, row["updates"])
 
-    def _reached(self, seed: int, *done: int) -> None:
+    def _reached(self, seed: int, gradient_steps: int, updates: int) -> None:
         if self._what != "learning":
             self.begins("learning", 0, 0)
-        self._done[seed] = done
+        self._done[seed] = gradient_steps, updates
         work = sum(n * w for each in self._done.values() for n, w in zip(each, self._weights, strict=True))
         steps = sum(map(sum, self._done.values()))
         self._progress.reach(work, mae=self._mae(), count=f"{steps:,} of {self._gradient_steps:,} gradient steps")
@@ -229,10 +230,12 @@ class Learning:
             self._progress.print(f"learned  {self._mae()}  {steps:,} gradient steps  {took}")
 
     def _mae(self) -> str:
-        unit = "" if self._plant.y_unit == "1" else f" {self._plant.y_unit}"
-        if len(self._done) == 1 or not self._maes:
-            return "".join(f"MAE {value}{unit}" for value in self._maes.values())
-        return f"MAE{unit}: " + ", ".join(f"seed {seed} {value}" for seed, value in sorted(self._maes.items()))
+        if not self._maes:
+            return ""
+        every = self._maes.items() if len(self._done) > 1 else ()
+        found = ", ".join(f"seed {seed} {mae}" for seed, mae in sorted(every)) or next(iter(self._maes.values()))
+        unit = "" if self._watched.plant.y_unit == "1" else f" {self._watched.plant.y_unit}"
+        return f"MAE {found}{unit} on {self._watched.id}"
 
 
 def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress) -> None:

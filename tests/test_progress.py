@@ -3,7 +3,9 @@
 import io
 import re
 import time
+from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import pytest
 from rich.console import Console
@@ -11,7 +13,7 @@ from rich.console import Console
 from jaxouter import cli, compare, evaluate, progress, train
 from jaxouter.evaluation import evaluate as evaluation
 from jaxouter.evaluation import scenarios
-from jaxouter.plants import REGISTRY
+from jaxouter.plants import REGISTRY, Plant
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset
 from tests import lag
@@ -51,7 +53,7 @@ def learning(clock: Clock, width: int = 80, seeds: int = 1) -> Progress:
     of.phase("compiling", 1500.0)
     clock.now += 10
     of.phase("learning")
-    mae = "MAE 2.812 crad" if seeds == 1 else "MAE crad: " + ", ".join(f"seed {i} 2.812" for i in range(seeds))
+    mae = "MAE " + ("2.812" if seeds == 1 else ", ".join(f"seed {i} 2.812" for i in range(seeds))) + " crad"
     for done in range(50, 501, 50):
         of.reach(done, mae=mae, count=f"{done:,} of 1,500 gradient steps")
         clock.now += 1
@@ -193,22 +195,29 @@ class Heard:
         self.done, self.best = done, best
 
 
+class Watched(NamedTuple):
+    """A scenario, as far as it is looked at."""
+
+    plant: Plant
+    id: str = "lag/steps"
+
+
 def begun(clock, config, plant, flop=(10.0, 1.0)):
     of = Progress(Console(file=io.StringIO(), force_terminal=True, width=80), clock=clock)
-    return of, train.Learning(of, config, plant, flop)
+    return of, train.Learning(of, config, Watched(plant), flop)
 
 
 def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
     config = small("heaters", seeds=2, pretraining=preset("heaters").pretraining)  # 2,000 gradient steps, 300 updates
     of, learned = begun(clock, config, lag.LAG)
     learned.pretrained(0, Heard(2_000), lambda: {"mae": 0.51234})
-    assert of.line.startswith("learning  MAE: seed 0 0.5123  2,000 of 4,600 gradient steps  49 %")
+    assert of.line.startswith("learning  MAE seed 0 0.5123 on lag/steps  2,000 of 4,600 gradient steps  49 %")
     learned.pretrained(1, Heard(1_000), lambda: pytest.fail("looked at again so soon"))
     learned.epoch(0, {"epoch": 1, "mae": 0.4, "updates": 150, "skipped": 0.125})
-    assert "MAE: seed 0 0.4  3,150 of 4,600 gradient steps  12.5% of the updates skipped  74 %" in of.line
+    assert "MAE seed 0 0.4 on lag/steps  3,150 of 4,600 gradient steps  12.5% of the updates skipped  74 %" in of.line
     learned.epoch(0, {"epoch": 2, "mae": 0.4, "updates": 300, "skipped": 0.0})
     learned.epoch(1, {"epoch": 2, "mae": 0.3, "updates": 300})
-    assert of.line.startswith("learning  MAE: seed 0 0.4, seed 1 0.3  4,600 of 4,600 gradient steps  100 %")
+    assert of.line.startswith("learning  MAE seed 0 0.4, seed 1 0.3 on lag/steps  4,600 of 4,600 gradient steps  100 %")
 
 
 def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
@@ -228,7 +237,7 @@ def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
     assert len(looks) >= 6
     assert min(b - a for a, b in pairwise(looks)) >= 5.0
     assert 0.2 * (len(looks) - 1) < 0.025 * 60.0
-    host = lag.LAG.__class__(**{**lag.LAG.__dict__, "differentiable": False})
+    host = replace(lag.LAG, differentiable=False)
     of, learned = begun(clock, config, host)
     learned.pretrained(0, Heard(50), lambda: pytest.fail("minutes of a simulator"))
     assert of.line.startswith("learning  cost a step on the model 0.25  50 of 1,500 gradient steps")
@@ -295,7 +304,7 @@ def test_evaluate_takes_a_policy_of_your_own(monkeypatch, capsys, tmp_path):
 
 def test_a_policy_that_the_plant_does_not_allow_is_refused(monkeypatch, capsys):
     plant, params = lag.make()
-    host = plant.__class__(**{**plant.__dict__, "differentiable": False})
+    host = replace(plant, differentiable=False)
     monkeypatch.setitem(REGISTRY, "lag", lambda: (host, params))
     with pytest.raises(SystemExit) as end:
         evaluate.main(["--policy", "oracle", "--scenario", "lag/steps"])
