@@ -201,14 +201,14 @@ class Learning:
         """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
         if self._watched.plant.differentiable:
             if self._pace.due():
-                self._maes[seed] = f"{self._pace.do(look)['mae']:.4g}"
+                self._maes[seed] = cli.number(self._pace.do(look)["mae"])
         elif math.isfinite(at.best):
-            self._progress.say(cost=f"cost a step on the model {-at.best:.3g}")
+            self._progress.say(cost=f"cost a step on the model {cli.number(-float(at.best), 3)}")
         self._reached(seed, int(at.done), 0)
 
     def epoch(self, seed: int, row: Row) -> None:
         """An epoch has ended; the start counts as one."""
-        self._maes[seed] = f"{row['mae']:.4g}"
+        self._maes[seed] = cli.number(row["mae"])
         for name, what in (("skipped", "updates skipped"), ("no_action", "actions not finite")):
             self._progress.say(**{name: f"{row[name]:.1%} of the {what}" if row.get(name) else ""})
         self._progress.say(cost="")

@@ -214,10 +214,14 @@ def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
     assert of.line.startswith("learning  MAE seed 0 0.5123 on lag/steps  2,000 of 4,600 gradient steps  49 %")
     learned.pretrained(1, Heard(1_000), lambda: pytest.fail("looked at again so soon"))
     learned.epoch(0, {"epoch": 1, "mae": 0.4, "updates": 150, "skipped": 0.125})
-    assert "MAE seed 0 0.4 on lag/steps  3,150 of 4,600 gradient steps  12.5% of the updates skipped  74 %" in of.line
+    assert (
+        "MAE seed 0 0.4000 on lag/steps  3,150 of 4,600 gradient steps  12.5% of the updates skipped  74 %" in of.line
+    )
     learned.epoch(0, {"epoch": 2, "mae": 0.4, "updates": 300, "skipped": 0.0})
     learned.epoch(1, {"epoch": 2, "mae": 0.3, "updates": 300})
-    assert of.line.startswith("learning  MAE seed 0 0.4, seed 1 0.3 on lag/steps  4,600 of 4,600 gradient steps  100 %")
+    assert of.line.startswith(
+        "learning  MAE seed 0 0.4000, seed 1 0.3000 on lag/steps  4,600 of 4,600 gradient steps  100 %"
+    )
 
 
 def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
@@ -240,7 +244,7 @@ def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
     host = replace(lag.LAG, differentiable=False)
     of, learned = begun(clock, config, host)
     learned.pretrained(0, Heard(50), lambda: pytest.fail("minutes of a simulator"))
-    assert of.line.startswith("learning  cost a step on the model 0.25  50 of 1,500 gradient steps")
+    assert of.line.startswith("learning  cost a step on the model 0.250  50 of 1,500 gradient steps")
 
 
 def made(mae, **other):
