@@ -14,8 +14,10 @@ from types import TracebackType
 from typing import Any
 
 import jax
+from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
@@ -120,13 +122,33 @@ class Interrupt:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; the first column to the left, the others to the right; narrow output is not cut."""
-    out = Table(title=title, title_justify="left", header_style="bold")
-    for i, column in enumerate(columns):
-        out.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
-    for row in rows:
-        out.add_row(*row)
-    console.print(out)
+    """Print a table; the first column to the left, the others to the right.
+
+    Narrow output is not cut: a table that is too wide has no box and, if need be, is printed in parts.
+    """
+    plain = [[Text.from_markup(row[i]).plain for row in (columns, *rows)] for i in range(len(columns))]
+    least = [
+        max(map(len, plain[0])),
+        *(max((len(word) for cell in cells for word in cell.split()), default=1) for cells in plain[1:]),
+    ]
+    room, rest = console.width, [*range(1, len(columns))]
+    boxed = sum(least) + 3 * len(least) + 1 <= room
+    style: dict[str, Any] = {} if boxed else dict(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    least = [min(width, room // 2 - 2) for width in least]
+    while rest:
+        shown, free = [0], room - 1 - 3 - least[0] if boxed else room - 2 - least[0]
+        while rest and (len(shown) == 1 or least[rest[0]] + 3 <= free):
+            free -= least[rest[0]] + (3 if boxed else 2)
+            shown.append(rest.pop(0))
+        out = Table(title=title, title_justify="left", header_style="bold", **style)
+        for i in shown:
+            wider = min(max(map(len, plain[i])) - least[i], max(0, free))
+            free -= wider
+            justify = "right" if i else "left"
+            out.add_column(columns[i], justify=justify, overflow="fold", width=least[i] + max(0, wider))
+        for row in rows:
+            out.add_row(*(row[i] for i in shown))
+        console.print(out)
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -94,9 +94,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "seconds": time.perf_counter() - begun,
             "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
         }
+        show(content)
         progress.phase("drawing", 0)
         page = write(plan, content, done)
-    show(content)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
 
 

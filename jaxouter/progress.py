@@ -137,7 +137,8 @@ class Progress:
         parts = [self._what, *self._said.values()]
         if self._work is not None and self._work.done:
             parts.append(f"{100 * self._work.done / self._work.total:.0f} %")
-        return "  ".join([*parts, *filter(None, [self.time])])
+        begins = not self._said and self._clock() - self._since < 1.0
+        return "  ".join(parts if begins else [*parts, self.time])
 
     @property
     def time(self) -> str:
@@ -146,7 +147,7 @@ class Progress:
         left = None if self._work is None else self._work.left(now)
         if left is not None:
             return f"{clock(left)} left"
-        return f"{clock(now - self._since)} elapsed" if now - self._since >= 1.0 else ""
+        return f"{clock(now - self._since)} elapsed"
 
     def _move(self, done: float) -> None:
         if self._work is not None and done > self._work.done:

@@ -227,7 +227,7 @@ class Learning:
         steps = sum(map(sum, self._done.values()))
         if steps:
             took = clock(time.monotonic() - self._begun)
-            self._progress.print(f"learned  {self._mae()}  {steps:,} gradient steps  {took}")
+            self._progress.print(f"learned in {took}  {self._mae()}  {steps:,} gradient steps")
 
     def _mae(self) -> str:
         if not self._maes:
@@ -255,8 +255,6 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     learned = {seed: evaluated(named) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
-    progress.phase("drawing", len(met) + 2)
-    main_figure = draw(run, met, simple_results, learned[median], progress.advance)
     summary = {
         "format": FORMAT,
         "median_seed": median,
@@ -271,6 +269,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned, places if run.config.randomise else {})
+    progress.phase("drawing", len(met) + 2)
+    main_figure = draw(run, met, simple_results, learned[median], progress.advance)
     print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 

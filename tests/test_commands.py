@@ -78,8 +78,9 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
     begun = [line.split("  ")[0] for line in done.stdout.splitlines()]  # plain lines where there is no terminal
     phases = ["preparing", "compiling", "learning", "evaluating", "drawing"]
     assert sorted(phases, key=begun.index) == phases
-    (learned,) = (line for line in done.stdout.splitlines() if line.startswith("learned  MAE seed 3 "))
-    assert " degC on heaters/paper-4  240 gradient steps  " in learned
+    (learned,) = (line for line in done.stdout.splitlines() if line.startswith("learned in "))
+    assert "  MAE seed 3 " in learned
+    assert learned.endswith(" degC on heaters/paper-4  240 gradient steps")
 
 
 def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):

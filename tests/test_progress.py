@@ -332,3 +332,19 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
     evaluate.chosen("oracle", "pitch", of)
     assert out.getvalue().startswith("identifying oracle\noracle on pitch: The learner's actor, trained by")
     assert said == ["identifying oracle  30% of it  30 %  0:35 left"]
+
+
+@pytest.mark.parametrize("width", [20, 40, 80, 99, 200])
+def test_tables_are_not_cut(width, monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(cli, "console", Console(file=out, force_terminal=True, width=width))
+    names = ["scenario", "inner loop alone", "static prefilter", "paper's DRL", "ours", "improvement, %"]
+    cells = ["pitch/delay-swapped", "10.91", "3.409", "3.90 of 10.91", "2.750 (2.736-2.764)", "74.8"]
+    cli.table("MAE in crad", names, [cells])
+    lines = STYLE.sub("", out.getvalue()).splitlines()
+    assert max(map(len, lines)) <= width
+    assert "…" not in out.getvalue()
+    if width >= 40:  # below, words are folded
+        assert all(word in " ".join(lines) for cell in (*names, *cells) for word in cell.split())
+    if width >= 80:
+        assert sum("pitch/delay-swapped" in line for line in lines) == 1  # in one part
