@@ -25,6 +25,7 @@ from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, open_run, surroundings, write_json
 
 FORMAT = 1
+OVERALL = 3  # figures of all scenarios: errors, effort, certificate
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
         }
         show(content)
-        progress.phase("drawing", 0)
-        page = write(plan, content, done)
+        page = write(plan, content, done, progress)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
 
 
@@ -218,7 +218,7 @@ def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
     }
 
 
-def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
+def write(plan: Plan, content: dict[str, Any], done: Sequence[Done], progress: Progress) -> Path:
     """comparison.json, comparison.csv, figures and the report; returns the report's path."""
     rows = content["rows"]
     write_json(plan.out / "comparison.json", content)
@@ -226,7 +226,10 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
         table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         table.writeheader()
         table.writerows(rows)
+    overall = OVERALL + len(plan.sweeps)
+    progress.phase("drawing", overall + len(plan.scenarios))
     figures, responses = comparison.draw(plan.out / "figures", content), {}
+    progress.advance(overall)
     lines = statistics.lines(rows, content["policies"])
     label = {(line.policy, line.run): line.label for line in lines}
     for name in plan.scenarios:
@@ -235,6 +238,7 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
         path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
         scenario = scenarios.get(name, family_seed=plan.family_seed)
         responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
+        progress.advance()
     return report.write(plan.out / "report.html", content, figures, responses)
 
 

@@ -188,6 +188,8 @@ def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     ]
     columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]
     cli.table(f"policy {policy}", columns, rows)
+    if places:
+        print("plant: where it lies among those of the training")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -67,7 +68,13 @@ class Progress:
         share = [bars.TaskProgressColumn()] if console.width >= NARROW else []
         self._bar = bars.Progress(bars.BarColumn(None), *share, _Time(self), expand=True)
         self._task = self._bar.add_task("", total=None, start=False)
-        self._display = Live(get_renderable=self._render, console=console, refresh_per_second=4, transient=True)
+        self._display = Live(
+            get_renderable=self._render,
+            console=console,
+            refresh_per_second=4,
+            transient=True,
+            redirect_stderr=sys.stderr is not None and sys.stderr.isatty(),  # else a file gets what is for it
+        )
 
     def __enter__(self) -> Progress:
         if not self._shown:

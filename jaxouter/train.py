@@ -160,7 +160,8 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
         return {"mae": mae(traces)}
 
     shown = Learning(progress, config, watched, flop)
-    with cli.Interrupt() as interrupt, closing(tensorboard.Events(run)) as events:
+    stopping = cli.Interrupt("what runs now ends, then everything is saved")
+    with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
         def heard(seed: int, row: Row) -> None:
             shown.epoch(seed, row)
@@ -271,7 +272,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     show(met, simple_results, learned, places if run.config.randomise else {})
     progress.phase("drawing", len(met) + 2)
     main_figure = draw(run, met, simple_results, learned[median], progress.advance)
-    print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
+    progress.print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 
 def draw(

@@ -2,6 +2,7 @@
 
 import io
 import re
+import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -168,6 +169,21 @@ def test_a_dumb_terminal_and_other_processes_get_no_bar(clock):
         of.phase("evaluating")
         of.print("nothing")
     assert out.getvalue() == "learning\n"
+
+
+def test_a_notebook_without_widgets_gets_lines(monkeypatch):
+    monkeypatch.setattr(progress.importlib.util, "find_spec", lambda name: None)
+    assert not Progress(Console(file=io.StringIO(), force_jupyter=True))._live
+    monkeypatch.setattr(progress.importlib.util, "find_spec", lambda name: name)
+    assert Progress(Console(file=io.StringIO(), force_jupyter=True))._live
+
+
+def test_what_goes_to_a_file_stays_there(monkeypatch):
+    errors = io.StringIO()
+    monkeypatch.setattr("sys.stderr", errors)
+    with Progress(Console(file=io.StringIO(), force_terminal=True, width=80)):
+        print("warning: so it is", file=sys.stderr)
+    assert errors.getvalue() == "warning: so it is\n"
 
 
 def test_the_terminal_is_left_as_it_was():
