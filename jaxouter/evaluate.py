@@ -146,14 +146,12 @@ def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
     found = board.contender(policy, plants.make(plant_name)[0])
     if found.kind == "user":
         return Named(found.name, *board.load(found, plant_name))
-    told = False
 
     def heard(text: str, share: float) -> None:
-        nonlocal told
-        if not told:
-            told = True
+        if not text:
             progress.print(f"{policy} on {plant_name}: {RIVALS[policy].note} This is done once, and kept.")
-            progress.phase(f"identifying {policy}")
+        elif share and not progress.done:
+            progress.phase(f"tuning {policy}")
         progress.reach(share, at=text)
 
     progress.phase(f"identifying {policy}", 1.0)

@@ -130,8 +130,7 @@ def main(arguments: list[str] | None = None) -> None:
             except (OSError, NotFiniteError) as error:
                 raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
             except KeyboardInterrupt:  # the second one, or after the training
-                print(f"stopped; what was saved before is whole, {go_on(run)}", file=sys.stderr)
-                raise SystemExit(130) from None
+                finals = None
     if finals is None:
         if devices.is_first():
             print(f"saved; {go_on(run)}", file=sys.stderr)

@@ -337,6 +337,7 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
     of = Progress(Console(file=out, width=140), clock=clock)
 
     def slow(name, plant, report):
+        report("", 0.0)
         for share in (0.1, 0.2, 0.3):
             clock.now += 5
             report(f"{share:.0%} of it", share)
@@ -346,8 +347,10 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
     said = []
     monkeypatch.setattr(evaluate, "rival", slow)
     evaluate.chosen("oracle", "pitch", of)
-    assert out.getvalue().startswith("identifying oracle\noracle on pitch: The learner's actor, trained by")
-    assert said == ["identifying oracle  30% of it  30 %  0:35 left"]
+    identifying, told, tuning = out.getvalue().splitlines()
+    assert (identifying, tuning) == ("identifying oracle", "tuning oracle")
+    assert told.startswith("oracle on pitch: The learner's actor, trained by back-propagation through the simulator.")
+    assert said == ["tuning oracle  30% of it  30 %  0:35 left"]
 
 
 @pytest.mark.parametrize("width", [20, 40, 80, 99, 200])
