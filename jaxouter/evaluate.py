@@ -13,7 +13,7 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import board, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival, work
+from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
 from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS
 from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, open_run, write_json
@@ -167,7 +167,9 @@ def evaluated(
         ValueError: a user's policy, `asked` for on the command line, failed.
     """
     pairs = [(policies[scenario.plant.name], scenario) for scenario in met]
-    progress.phase("evaluating", sum(work(named.name, scenario) for named, scenario in pairs))
+    plants_met = {scenario.plant.name: scenario.plant for scenario in met}.values()
+    total = sum(work(named.name, scenario) for named, scenario in pairs)
+    progress.phase("evaluating", total, counter=counter(plants_met))
     results: Results = {}
     for i, (named, scenario) in enumerate(pairs):
         progress.say(scenario=f"{scenario.id}, {i + 1} of {len(met)} scenarios")

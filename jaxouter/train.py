@@ -19,7 +19,7 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival, work
+from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
@@ -193,8 +193,14 @@ class Learning:
     def begins(self, what: str, done: int, of: int) -> None:
         """What is going on before gradient steps; so much of it is done."""
         if what != self._what:
+            slow = counter([self._watched.plant])
+            if slow is not None and what == "recording":
+                self._progress.phase(what, self._config.identification_steps, counter=slow)
+            elif slow is not None and self._what == "recording":
+                self._progress.phase(what, self._work, self._worked())
+            else:
+                self._progress.phase(what)
             self._what = what
-            self._progress.phase(what)
         self._progress.say(pieces=f"{done} of {of} plants" if of > 1 else "")
 
     def pretrained(self, seed: int, at: Rehearsal, look: Callable[[], Row]) -> None:
@@ -218,9 +224,10 @@ class Learning:
         if self._what != "learning":
             self.begins("learning", 0, 0)
         self._done[seed] = gradient_steps, updates
-        work = sum(n * w for each in self._done.values() for n, w in zip(each, self._weights, strict=True))
         steps = sum(map(sum, self._done.values()))
-        self._progress.reach(work, mae=self._mae(), count=f"{steps:,} of {self._gradient_steps:,} gradient steps")
+        self._progress.reach(
+            self._worked(), mae=self._mae(), count=f"{steps:,} of {self._gradient_steps:,} gradient steps"
+        )
 
     def end(self) -> None:
         """A line that stays, where something has been learned."""
@@ -228,6 +235,9 @@ class Learning:
         if steps:
             took = clock(time.monotonic() - self._begun)
             self._progress.print(f"learned in {took}  {self._mae()}  {steps:,} gradient steps")
+
+    def _worked(self) -> float:
+        return sum(n * w for each in self._done.values() for n, w in zip(each, self._weights, strict=True))
 
     def _mae(self) -> str:
         if not self._maes:
@@ -243,7 +253,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     plant, (trainer, _) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
     names = [*SIMPLE, *("learned" for _ in finals)]
-    progress.phase("evaluating", sum(work(name, scenario) for name in names for scenario in met))
+    total = sum(work(name, scenario) for name in names for scenario in met)
+    progress.phase("evaluating", total, counter=counter([met[0].plant]))
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}

@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -14,7 +15,7 @@ from rich.console import Console
 from jaxouter import cli, compare, evaluate, progress, train
 from jaxouter.evaluation import evaluate as evaluation
 from jaxouter.evaluation import scenarios
-from jaxouter.plants import REGISTRY, Plant
+from jaxouter.plants import REGISTRY, Plant, host
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset
 from tests import lag
@@ -367,3 +368,36 @@ def test_tables_are_not_cut(width, monkeypatch):
         assert all(word in " ".join(lines) for cell in (*names, *cells) for word in cell.split())
     if width >= 80:
         assert sum("pitch/delay-swapped" in line for line in lines) == 1  # in one part
+
+
+def test_recording_from_a_simulator_has_a_bar_of_its_own(clock, monkeypatch):
+    monkeypatch.setitem(REGISTRY, "lag", lag.make)
+    simulators = SimpleNamespace(speed=SimpleNamespace(steps=1_000))
+    monkeypatch.setattr(host, "of", lambda plant: simulators, raising=False)
+    config = replace(
+        small("lag", pretraining=preset("pitch").pretraining), residual=True
+    )  # 64 + 8 episodes of 50 steps
+    of, learned = begun(clock, config, lag.LAG)
+    learned.begins("recording", 0, 0)
+    for _ in range(2):
+        clock.now += 9
+        simulators.speed.steps += 900
+        of._count()
+    assert of.line == "recording  50 %  0:18 left"
+    learned.begins("compiling", 0, 0)
+    assert of.line == "compiling"
+    learned.pretrained(0, Heard(750), lambda: {"mae": 2.5})
+    assert of.line.startswith("learning  MAE 2.500 on lag/steps  750 of 1,800 gradient steps  49 %")
+
+
+def test_ctrl_c_after_the_learning_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(REGISTRY, "lag", lag.make)
+    monkeypatch.setattr(train, "learn", lambda *_: {})
+    monkeypatch.setattr(train, "report", interrupted)
+    with pytest.raises(SystemExit) as end:
+        train.main(["lag", "--out", str(tmp_path / "run")])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == f"saved; go on with: python -m jaxouter.train --resume {tmp_path}/run\n"

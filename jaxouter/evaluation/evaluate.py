@@ -12,7 +12,7 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop.policy import Policy, none
-from jaxouter.plants import make
+from jaxouter.plants import Plant, host, make
 
 Results = dict[str, tuple[Traces, dict[str, Any]]]  # by the scenario's id
 
@@ -39,6 +39,13 @@ def rival(name: str, plant_name: str, report: Report = lambda text, share: None)
 def work(name: str, scenario: Scenario) -> int:
     """Control steps that `evaluate` takes, for the policy of that name and for the inner loop alone."""
     return scenario.r.size * (1 if name == "none" else 2)
+
+
+def counter(plants: Iterable[Plant]) -> Callable[[], float] | None:
+    """Control steps that the simulators of plants outside JAX have made so far; None where there are none."""
+    of = getattr(host, "of", lambda plant: None)
+    simulators = list(filter(None, map(of, plants)))
+    return (lambda: sum(each.speed.steps for each in simulators)) if simulators else None
 
 
 def evaluate(
