@@ -136,7 +136,7 @@ class Progress:
     def print(self, text: str) -> None:
         """A line that stays."""
         if self._shown:
-            self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+            self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=not self._live)
 
     @property
     def line(self) -> str:
