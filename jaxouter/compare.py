@@ -76,14 +76,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
             if options.list:
                 return cli.print_lists()
-            progress = stack.enter_context(cli.progress())
-            progress.phase("preparing")
             plan = check(options)
             cli.use_compilation_cache()
             try:
                 plan.out.mkdir(parents=True)
             except OSError as error:
                 raise ValueError(f"the folder {plan.out} can't be made: {error.strerror}") from None
+            progress = stack.enter_context(cli.progress())
             try:
                 done = work(plan, progress)
             except BaseException:

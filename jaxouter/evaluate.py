@@ -65,11 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
-        progress = stack.enter_context(cli.progress())
-        progress.phase("preparing")
         if options.plant is not None:
             options = replace(options, plant=add_plant(options.plant, options.run))
         check(options)
+        progress = stack.enter_context(cli.progress())
+        progress.phase("preparing")
         cli.use_compilation_cache()
         policies, origin = choose(options, progress)
         names = options.scenario or [name for plant in policies for name in scenarios.catalogue(plant)]

@@ -45,9 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ExitStack() as stack:
         with cli.user_errors():
             options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
+            run_path, kind, out = check(options)
             progress = stack.enter_context(cli.progress())
             progress.phase("preparing")
-            run_path, kind, out = check(options)
             run, seed, _ = open_run(run_path)
             cli.use_compilation_cache()
             state, _ = run.load(seed)
