@@ -46,14 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with cli.user_errors():
             options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
             run_path, kind, out = check(options)
-            progress = stack.enter_context(cli.progress())
-            progress.phase("preparing")
             run, seed, _ = open_run(run_path)
             cli.use_compilation_cache()
             state, _ = run.load(seed)
         trainer, _ = run.trainer
         policy, params = trainer.policy, trainer.policy_params(state)
         law = Law.of(policy, params, trainer.env.plant)
+        progress = stack.enter_context(cli.progress())
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent))
         made = Path(place) / out.name
         progress.phase("writing")
