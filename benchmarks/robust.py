@@ -36,7 +36,7 @@ def contenders(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
     yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
-    limit = oracle.retrained(run.config, lambda text: print(f"{LIMIT}: {text}", flush=True))
+    limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
     yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
     for name in RIVALS:
         yield name, [rival(name, run.config.plant)]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -28,52 +29,58 @@ MOVED = 1e-3  # of the largest response: y that has moved so far has begun to
 class Options:
     """Test whether a plant of your own keeps the contract, and show how it responds to r~.
 
-    Exit status 1 where it does not. The picture shows y after r~ has moved up or down from the middle of its range.
-    Of a log it is told, and shown, how far its models can be trusted.
+    Exit status 1 where it does not. Of a log it is told how far its models can be trusted. With --figure it is drawn
+    too: y after r~ has moved up or down from the middle of its range; or what the models of a log tell.
     """
 
     plant: Annotated[str, tyro.conf.Positional]
     """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, log:FILE, pitch or heaters."""
     figure: Path | None = None
-    """File for the picture; default: step-response.png, or log.png for a log."""
+    """File for the picture; default: none is drawn."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
+    with cli.user_errors(), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.check", args=arguments)
+        figure = options.figure
+        if figure is not None and not figure.resolve().parent.is_dir():
+            raise ValueError(f"--figure is {figure}; its folder does not exist")
+        progress = stack.enter_context(cli.progress())
+        progress.phase("preparing")
         plant, params = plants.make(add(options.plant, options.plant_options))
         cli.use_compilation_cache()
-        figure = options.figure or Path("log.png" if plant.identified else "step-response.png")
-        if not figure.resolve().parent.is_dir():
-            raise ValueError(f"--figure is {figure}; its folder does not exist")
+        progress.phase("checking")
         found = [("shapes and types", None), *contract.behaviour(plant, params)]
         cli.table(f"{plant.name}: the contract", ["what", "is"], [[what, wrong or "kept"] for what, wrong in found])
         if plant.identified:
-            picture = log_report(plant, options.plant.partition(":")[2], figure)
+            progress.phase("validating")
+            draw = log_report(plant, options.plant.partition(":")[2])
         else:
-            picture = response_report(plant, params, figure)
-    if picture is not None:
-        print(f"figure: {picture}")
+            progress.phase("responding")
+            draw = response_report(plant, params)
+        if figure is not None:
+            progress.phase("drawing")
+            with cli.optional("figure"):
+                progress.print(f"figure: {draw(figure)}")
     if any(wrong for _, wrong in found):
         raise SystemExit(1)
 
 
-def log_report(plant: Plant, path: str, figure: Path) -> Path | None:
-    """How far the log of this plant can be trusted, told and drawn."""
+def log_report(plant: Plant, path: str) -> Callable[[Path], Path]:
+    """How far the log of this plant can be trusted; returns what draws it."""
     told = trust.report(*log.identified(path))
     rows = [list(row) for row in trust.table(told, plant.y_unit, plant.time_unit)]
     cli.table(f"{plant.name}: how far the log can be trusted", ["what", "is"], rows)
     for warning in told.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    with cli.optional("figure"):
-        return figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
+    return lambda figure: figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
 
 
-def response_report(plant: Plant, params: object, figure: Path) -> Path | None:
-    """How the plant responds to r~, told and drawn."""
+def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
+    """How the plant responds to r~; returns what draws it."""
     gain, offset = identify.dc_gain(plant, params, jax.random.key(0))
     moves, responses = step_responses(plant, params)
     reached = sorted(float(offset + gain * end) for end in plant.r_tilde_bounds)
@@ -86,8 +93,7 @@ def response_report(plant: Plant, params: object, figure: Path) -> Path | None:
     cli.table(f"{plant.name}: how it responds", ["what", "is"], [list(line) for line in lines])
     if reached[0] > plant.setpoint_range[0] or reached[1] < plant.setpoint_range[1]:
         print("warning: no r~ within its bounds holds y at every set-point", file=sys.stderr)
-    with cli.optional("figure"):
-        return figures.step_responses(figure, plant, moves, responses)
+    return lambda figure: figures.step_responses(figure, plant, moves, responses)
 
 
 def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray]:

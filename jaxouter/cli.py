@@ -11,28 +11,28 @@ import shutil
 import signal
 import sys
 import threading
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
 import jax
+from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants.sources import FORMS, Source, add
-from jaxouter.training.config import OWN, PRESETS, TrainConfig
+from jaxouter.progress import Progress
+from jaxouter.training.config import OWN, PRESETS
 from jaxouter.training.run import RunWarning
 
-LINE_SECONDS = 5.0  # between two plain lines of progress
 NARROWEST = 20  # columns
 
 
@@ -203,6 +203,11 @@ def print_lists() -> None:
     console.print("policies: a run folder, " + ", ".join(NAMES))
 
 
+def progress(shown: bool = True) -> Progress:
+    """Progress on the console of the commands; not shown in processes but the first."""
+    return Progress(console, shown)
+
+
 class Interrupt:
     """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can save itself; the second one ends it at once."""
 
@@ -232,142 +237,34 @@ class Interrupt:
             signal.signal(number, handler)
 
 
-class TrainingProgress:
-    """A live bar for each seed on a terminal, plain lines elsewhere."""
-
-    def __init__(self, config: TrainConfig, unit: str) -> None:
-        self._config, self._unit = config, unit
-        self._bars = Progress(
-            TextColumn("seed {task.fields[seed]}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._tasks: dict[int, Any] = {}
-        self._begin = self._last = time.monotonic()
-        self._first: int | None = None
-
-    def __enter__(self) -> TrainingProgress:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
-        """Show the row of an epoch."""
-        cfg, epoch, now = self._config, row["epoch"], time.monotonic()
-        if epoch == 0:
-            return self._show(seed, f"pretrained  MAE {number(row['mae'])} {self._unit}")
-        text = (
-            f"{row['steps']:,} steps ({row['steps_per_second']:,.0f}/s)  "
-            f"{row['updates']:,} updates ({row['updates_per_second']:,.0f}/s)  MAE {number(row['mae'])} {self._unit}"
-        )
-        if row.get("skipped", 0) or row.get("no_action", 0):
-            text += f"  {row['skipped']:.1%} of the updates skipped, {row['no_action']:.1%} of the actions not finite"
-        if console.is_terminal:
-            if seed not in self._tasks:
-                self._tasks[seed] = self._bars.add_task("", total=cfg.epochs, seed=seed, text="")
-            self._bars.update(self._tasks[seed], completed=epoch, text=text)
-        elif epoch == cfg.epochs or now - self._last >= LINE_SECONDS:
-            self._first = epoch - 1 if self._first is None else self._first
-            left = (now - self._begin) / max(1, epoch - self._first) * (cfg.epochs - epoch)
-            print(f"seed {seed}  epoch {epoch}/{cfg.epochs}  {text}  {left:.0f} s left", flush=True)
-            self._last = now
-
-    def pretrained(self, seed: int, done: int) -> None:
-        """Show how many gradient steps of the start are done."""
-        now = time.monotonic()
-        if console.is_terminal or now - self._last >= LINE_SECONDS:
-            self._show(seed, f"pretraining: {done:,} of {self._config.pretraining.gradient_steps:,} gradient steps")
-            self._last = now
-
-    def _show(self, seed: int, text: str) -> None:
-        if not console.is_terminal:
-            print(f"seed {seed}  {text}", flush=True)
-            return
-        if seed not in self._tasks:
-            self._tasks[seed] = self._bars.add_task("", total=self._config.epochs, seed=seed, text="")
-        self._bars.update(self._tasks[seed], text=text)
-
-
-class JobProgress:
-    """A live bar over many jobs on a terminal, plain lines elsewhere; on both what a long one says meanwhile."""
-
-    def __init__(self, total: int) -> None:
-        self._bar = Progress(
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("", total=total)
-        self._done, self._total, self._last = 0, total, time.monotonic()
-
-    def __enter__(self) -> JobProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def say(self, text: str) -> None:
-        """What one of the jobs is at."""
-        self._bar.update(self._task, description=text)
-        if not console.is_terminal and time.monotonic() - self._last >= LINE_SECONDS:
-            print(f"{self._done}/{self._total} jobs  {text}", flush=True)
-            self._last = time.monotonic()
-
-    def advance(self, text: str) -> None:
-        """One more is done."""
-        self._done += 1
-        self._bar.advance(self._task)
-        self.say(text)
-
-
-class Ticker:
-    """What goes on, in one line: live on a terminal, now and then elsewhere."""
-
-    def __init__(self) -> None:
-        self._status = console.status("")
-        self._seconds = 0.5 if console.is_terminal else LINE_SECONDS
-        self._last = time.monotonic()
-
-    def __enter__(self) -> Ticker:
-        if console.is_terminal:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._status.stop()
-
-    @property
-    def due(self) -> bool:
-        """Whether it is time to say something."""
-        return time.monotonic() - self._last >= self._seconds
-
-    def __call__(self, text: str) -> None:
-        """Say it."""
-        self._last = time.monotonic()
-        if console.is_terminal:
-            self._status.update(text)
-        else:
-            print(text, flush=True)
-
-
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; the first column to the left, the others to the right; narrow output is not cut."""
-    out = Table(title=title, title_justify="left", header_style="bold")
-    for i, column in enumerate(columns):
-        out.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
-    for row in rows:
-        out.add_row(*row)
-    console.print(out)
+    """Print a table; the first column to the left, the others to the right.
+
+    Narrow output is not cut: a table that is too wide has no box and, if need be, is printed in parts.
+    """
+    plain = [[Text.from_markup(row[i]).plain for row in (columns, *rows)] for i in range(len(columns))]
+    least = [
+        max(map(len, plain[0])),
+        *(max((len(word) for cell in cells for word in cell.split()), default=1) for cells in plain[1:]),
+    ]
+    room, rest = console.width, [*range(1, len(columns))]
+    boxed = sum(least) + 3 * len(least) + 1 <= room
+    style: dict[str, Any] = {} if boxed else dict(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    least = [min(width, room // 2 - 2) for width in least]
+    while rest:
+        shown, free = [0], room - 1 - 3 - least[0] if boxed else room - 2 - least[0]
+        while rest and (len(shown) == 1 or least[rest[0]] + 3 <= free):
+            free -= least[rest[0]] + (3 if boxed else 2)
+            shown.append(rest.pop(0))
+        out = Table(title=title, title_justify="left", header_style="bold", **style)
+        for i in shown:
+            wider = min(max(map(len, plain[i])) - least[i], max(0, free))
+            free -= wider
+            justify = "right" if i else "left"
+            out.add_column(columns[i], justify=justify, overflow="fold", width=least[i] + max(0, wider))
+        for row in rows:
+            out.add_row(*(row[i] for i in shown))
+        console.print(out)
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -8,6 +8,7 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,12 +19,13 @@ import tyro
 from jaxouter import cli, plants
 from jaxouter.evaluation import board, comparison, report, scenarios, statistics, sweeps
 from jaxouter.evaluation.board import Contender, Done, Job
-from jaxouter.evaluation.rivals import CLAIRVOYANT, NAMES, RIVALS
 from jaxouter.plants import Plant
-from jaxouter.plants.sources import SOURCES, attribute
+from jaxouter.plants.sources import SOURCES
+from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, open_run, surroundings, write_json
 
 FORMAT = 1
+OVERALL = 3  # figures of all scenarios: errors, effort, certificate
 
 
 @dataclass(frozen=True)
@@ -69,28 +71,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     begun = time.perf_counter()
     arguments = sys.argv[1:] if arguments is None else arguments
-    with cli.user_errors():
-        options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
-        if options.list:
-            return cli.print_lists()
-        plan = check(options)
-        cli.use_compilation_cache()
-        try:
-            plan.out.mkdir(parents=True)
-        except OSError as error:
-            raise ValueError(f"the folder {plan.out} can't be made: {error.strerror}") from None
-        try:
-            done = work(plan)
-        except BaseException:
-            plan.out.rmdir()  # still empty, and its name is wanted again
-            raise
-    content = assemble(plan, done)
-    content |= {
-        "seconds": time.perf_counter() - begun,
-        "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
-    }
-    show(content)
-    page = write(plan, content, done)
+    with ExitStack() as stack:
+        with cli.user_errors():
+            options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
+            if options.list:
+                return cli.print_lists()
+            plan = check(options)
+            cli.use_compilation_cache()
+            try:
+                plan.out.mkdir(parents=True)
+            except OSError as error:
+                raise ValueError(f"the folder {plan.out} can't be made: {error.strerror}") from None
+            progress = stack.enter_context(cli.progress())
+            try:
+                done = work(plan, progress)
+            except BaseException:
+                plan.out.rmdir()  # still empty, and its name is wanted again
+                raise
+        progress.phase("statistics", 0)
+        content = assemble(plan, done)
+        content |= {
+            "seconds": time.perf_counter() - begun,
+            "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
+        }
+        show(content)
+        page = write(plan, content, done, progress)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
 
 
@@ -140,25 +145,16 @@ def named(names: Sequence[str], plant: Plant) -> list[Contender]:
     Raises:
         ValueError: there is no such policy or file, or the plant does not allow it.
     """
-    needs = {"oracle": ("differentiable", plant.differentiable), CLAIRVOYANT: ("affine", plant.affine)}
-    impossible = {name: what for name, (what, holds) in needs.items() if not holds}
     own, built_in = [], []
     for name in dict.fromkeys(names):
-        file, colon, name_in_file = name.rpartition(":")
-        if colon and file.endswith(".py"):
-            attribute(Path(file), name_in_file, board.OWN)
-            own.append(Contender(f"{Path(file).name}:{name_in_file}", "user", file, None, name_in_file))
-            if [c.name for c in own].count(own[-1].name) > 1:  # of several files with this name
-                own[-1] = own[-1]._replace(name=name)
-        elif name in impossible:
-            raise ValueError(f"there is no {name} for {plant.name}, which is not declared {impossible[name]}")
-        elif name in NAMES:
-            built_in.append(name)
+        found = board.contender(name, plant)
+        if found.kind == "user":
+            same = any(found.name == other.name for other in own)  # of several files with this name
+            own.append(found._replace(name=name) if same else found)
         else:
-            raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
-    possible = [name for name in NAMES if name not in impossible]
-    chosen = [name for name in possible if name == "none" or not built_in or name in built_in]
-    return own + [Contender(name, "preview" if name == CLAIRVOYANT else RIVALS[name].kind) for name in chosen]
+            built_in.append(name)
+    chosen = [name for name in board.possible(plant) if name == "none" or not built_in or name in built_in]
+    return own + [board.contender(name, plant) for name in chosen]
 
 
 def folder(out: Path | None, plant: str) -> Path:
@@ -175,14 +171,24 @@ def folder(out: Path | None, plant: str) -> Path:
     return next(p for p in (base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))) if not p.exists())
 
 
-def work(plan: Plan) -> list[Done]:
+def work(plan: Plan, progress: Progress) -> list[Done]:
     """All jobs done, in their order, with progress."""
     jobs = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
     done: dict[Job, Done] = {}
-    with cli.JobProgress(len(jobs)) as progress:
-        for finished in board.spread(jobs, partial(cli.use_plants, tuple(SOURCES.values())), progress.say):
-            done[finished.job] = finished
-            progress.advance(f"{finished.job}: {finished.seconds:.0f} s")
+    shares: dict[Job, float] = {}  # of each that has begun
+    progress.phase("comparing", sum(job.work for job in jobs))
+
+    def heard(job: Job, text: str, share: float) -> None:
+        shares[job] = share
+        progress.reach(
+            sum(share * job.work for job, share in shares.items()),
+            count=f"{len(done)} of {len(jobs)} jobs",
+            job=f"{job}: {text}" if text else str(job),
+        )
+
+    for finished in board.spread(jobs, partial(cli.use_plants, tuple(SOURCES.values())), heard):
+        done[finished.job] = finished
+        heard(finished.job, f"{finished.seconds:.0f} s", 1.0)
     return [done[job] for job in jobs]
 
 
@@ -211,7 +217,7 @@ def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
     }
 
 
-def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
+def write(plan: Plan, content: dict[str, Any], done: Sequence[Done], progress: Progress) -> Path:
     """comparison.json, comparison.csv, figures and the report; returns the report's path."""
     rows = content["rows"]
     write_json(plan.out / "comparison.json", content)
@@ -223,22 +229,34 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done]) -> Path:
     responses: dict[str, Path] = {}
     lines = statistics.lines(rows, content["policies"])
     label = {(line.policy, line.run): line.label for line in lines}
+    overall = OVERALL + len(plan.sweeps)
+    progress.phase("drawing", overall + len(plan.scenarios))
     with cli.optional("figures"):
         figures |= comparison.draw(plan.out / "figures", content)
+        progress.advance(overall)
         for name in plan.scenarios:
             traces = {label[c.line]: t for c, t in board.first_episodes(done, name).items()}
             traces = {line.label: traces[line.label] for line in lines}
             path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
             scenario = scenarios.get(name, family_seed=plan.family_seed)
             responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
+            progress.advance()
     return report.write(plan.out / "report.html", content, figures, responses)
 
 
 def show(content: dict[str, Any]) -> None:
     """Print MAE and ratio to the limit, the best of each scenario in bold."""
-    columns, rows = statistics.table(content["rows"], content["policies"], "[bold]{}[/bold]")
+    best = "[bold]{}[/bold]" if cli.console.is_terminal else "{}*"
+    columns, rows = statistics.table(content["rows"], content["policies"], best)
     cli.table(f"MAE, {content['y_unit']}", columns, rows)
-    print("In brackets: ratio to the limit (oracle). Bold: best without the model. !: outside the limits of the plant.")
+    legend = {
+        " (": "In brackets: ratio to the limit (oracle).",
+        "[bold]": "Bold: best without the model.",
+        "*": "*: best without the model.",
+        "!": "!: outside the limits of the plant.",
+    }
+    if notes := [note for sign, note in legend.items() if any(sign in cell for row in rows for cell in row[1:])]:
+        print(" ".join(notes))
 
 
 if __name__ == "__main__":

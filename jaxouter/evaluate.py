@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,9 +12,10 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
-from jaxouter.evaluation.rivals import RIVALS
+from jaxouter.evaluation import board, scenarios
+from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
+from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS
+from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, open_run, write_json
 
 SHOWN = (
@@ -40,8 +42,9 @@ class Options:
     """Run folder, or the folder of one seed in it."""
     plant: str | None = None
     """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; without a run, that of the policy."""
-    policy: str | None = None
-    """A rival instead, such as none (r~ = r) or static (inverse of the DC gain); identified first, once."""
+    policy: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE.py:CLASS")] = None
+    """A rival instead, such as none (r~ = r) or static (inverse of the DC gain), identified first, once; or a policy of
+    your own."""
     scenario: tuple[str, ...] = ()
     """Scenarios, such as pitch/paper; see --list."""
     episodes: int | None = None
@@ -58,26 +61,23 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
+    with cli.user_errors(), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
         if options.plant is not None:
             options = replace(options, plant=add_plant(options.plant, options.run))
         check(options)
+        progress = stack.enter_context(cli.progress())
+        progress.phase("preparing")
         cli.use_compilation_cache()
-        policies, origin = choose(options)
+        policies, origin = choose(options, progress)
         names = options.scenario or [name for plant in policies for name in scenarios.catalogue(plant)]
         foreign = [name for name in names if name.split("/")[0] not in policies]
         if foreign:
             raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
-
-    results: Results = {}
-    with cli.console.status("") as status:
-        for i, name in enumerate(names):
-            status.update(f"{name} ({i + 1} of {len(names)})")
-            scenario = scenarios.get(name, options.episodes, options.family_seed)
-            results |= evaluate(policies[scenario.plant.name], [scenario])
+        met = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
+        results = evaluated(policies, met, options.policy, progress)
     named = next(iter(policies.values()))
     show(named.name, results, origin.get("places", {}))
     if options.json is not None:
@@ -98,9 +98,11 @@ def check(options: Options) -> None:
         ValueError: the options do not fit together, or name what does not exist.
     """
     if options.run is None and options.policy is None:
-        raise ValueError(f"say what to evaluate: a run folder, or --policy with one of {', '.join(RIVALS)}")
-    if options.policy is not None and options.policy not in RIVALS:
-        raise ValueError(f"there is no policy {options.policy!r}; the policies are: {', '.join(RIVALS)}")
+        raise ValueError(
+            f"say what to evaluate: a run folder, or --policy with FILE.py:CLASS or one of {', '.join(RIVALS)}"
+        )
+    if options.policy == CLAIRVOYANT:
+        raise ValueError(f"{CLAIRVOYANT} is a bound, not a policy; python -m jaxouter.compare shows it")
     if options.episodes is not None and options.episodes < 1:
         raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
     if not 0 <= options.family_seed < 2**32:
@@ -112,7 +114,7 @@ def check(options: Options) -> None:
         scenarios.builder(name)
 
 
-def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
+def choose(options: Options, progress: Progress) -> tuple[dict[str, Named], dict[str, Any]]:
     """The policy for each plant, and where it comes from (for the JSON).
 
     Raises:
@@ -122,7 +124,7 @@ def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
         every = set(plants.REGISTRY) if options.plant is None else {options.plant}
         given = {name.split("/")[0] for name in options.scenario} or every
         names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
-        return {name: rival(options.policy, name) for name in names}, {}
+        return {name: chosen(options.policy, name, progress) for name in names}, {}
     assert options.run is not None  # as `check` found
     run, seed, _ = open_run(options.run)
     state, _ = run.load(seed)
@@ -135,6 +137,48 @@ def choose(options: Options) -> tuple[dict[str, Named], dict[str, Any]]:
     return {run.config.plant: named}, origin
 
 
+def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
+    """The user's own policy, or a rival, which is identified unless the cache has it; that is told.
+
+    Raises:
+        ValueError: there is no such policy, the plant does not allow it, or it can't be made.
+    """
+    found = board.contender(policy, plants.make(plant_name)[0])
+    if found.kind == "user":
+        return Named(found.name, *board.load(found, plant_name))
+
+    def heard(text: str, share: float) -> None:
+        if not text:
+            progress.print(f"{policy} on {plant_name}: {RIVALS[policy].note} This is done once, and kept.")
+        elif share and not progress.done:
+            progress.phase(f"tuning {policy}")
+        progress.reach(share, at=text)
+
+    progress.phase(f"identifying {policy}", 1.0)
+    return rival(policy, plant_name, heard)
+
+
+def evaluated(
+    policies: Mapping[str, Named], met: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
+) -> Results:
+    """The policy of each plant on its scenarios.
+
+    Raises:
+        ValueError: a user's policy, `asked` for on the command line, failed.
+    """
+    pairs = [(policies[scenario.plant.name], scenario) for scenario in met]
+    plants_met = {scenario.plant.name: scenario.plant for scenario in met}.values()
+    total = sum(work(named.name, scenario) for named, scenario in pairs)
+    progress.phase("evaluating", total, counter=counter(plants_met))
+    results: Results = {}
+    for i, (named, scenario) in enumerate(pairs):
+        progress.say(scenario=f"{scenario.id}, {i + 1} of {len(met)} scenarios")
+        with board.blamed(named.name, f"failed on {scenario.id}", asked not in (None, *RIVALS)):
+            results |= evaluate(named, [scenario])
+        progress.advance(work(named.name, scenario))
+    return results
+
+
 def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     """Print the table; with where each plant lies among those of the training, where that is known."""
     rows = [
@@ -144,6 +188,8 @@ def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     ]
     columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]
     cli.table(f"policy {policy}", columns, rows)
+    if places:
+        print("plant: where it lies among those of the training")
 
 
 if __name__ == "__main__":

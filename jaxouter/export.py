@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -41,18 +42,22 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
-        options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
-        run_path, kind, out = check(options)
-        run, seed, _ = open_run(run_path)
-        cli.use_compilation_cache()
-        state, _ = run.load(seed)
-    trainer, _ = run.trainer
-    policy, params = trainer.policy, trainer.policy_params(state)
-    law = Law.of(policy, params, trainer.env.plant)
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent) as place:
+    with ExitStack() as stack:
+        with cli.user_errors():
+            options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
+            run_path, kind, out = check(options)
+            run, seed, _ = open_run(run_path)
+            cli.use_compilation_cache()
+            state, _ = run.load(seed)
+        trainer, _ = run.trainer
+        policy, params = trainer.policy, trainer.policy_params(state)
+        law = Law.of(policy, params, trainer.env.plant)
+        progress = stack.enter_context(cli.progress())
+        place = stack.enter_context(tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent))
         made = Path(place) / out.name
+        progress.phase("writing")
         write(kind, made, law, policy, params)
+        progress.phase("verifying")
         found = verified(kind, made, law, policy, params)
         for path in written(kind, made):
             path.replace(out.with_name(path.name))

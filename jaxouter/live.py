@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from jaxouter.deploy.live_folder import SIGNALS, Declaration, LiveFolder, open_f
 from jaxouter.deploy.realtime import Loop, Row, Settings, StepError, run
 from jaxouter.evaluation import figures
 from jaxouter.plants.sources import attribute
+from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, write_json
 
 KEPT = {"static": "static inverse", "trained": "as trained"}
@@ -113,8 +115,9 @@ def check(options: Options) -> Callable[[float], Any]:
 def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
     """Run, with progress, and save; why it ended early."""
     stopped = None
-    with cli.Interrupt("everything is saved") as interrupt, cli.Ticker() as ticker, folder.rows() as rows:
-        tell = Telling(loop, ticker)
+    with cli.Interrupt("everything is saved") as interrupt, cli.progress() as progress, folder.rows() as rows:
+        progress.phase("running", steps or 0)
+        tell = Telling(loop, progress)
 
         def heard(row: Row) -> None:
             rows.writerow(row)
@@ -131,8 +134,11 @@ def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
 class Telling:
     """What goes on, and each change of the stage."""
 
-    def __init__(self, loop: Loop, ticker: cli.Ticker) -> None:
-        self._loop, self._ticker = loop, ticker
+    SECONDS = 0.5  # between two looks
+
+    def __init__(self, loop: Loop, progress: Progress) -> None:
+        self._loop, self._progress, self._last = loop, progress, time.monotonic()
+        self._begun = loop.steps
         self._stage: str | None = None
         self._errors: deque[float] = deque(maxlen=500)
         self._r: float | None = None
@@ -145,12 +151,17 @@ class Telling:
         self._r = row.r
         if loop.stage != self._stage:
             self._stage = loop.stage
-            cli.console.print(f"step {row.step:,}: {self._stage}")
-        if self._ticker.due and self._errors:
-            trouble = "" if loop.trouble is None else f"  {loop.trouble}"
-            self._ticker(
-                f"{loop.steps:,} steps  {loop.stage}  |r - y| {np.mean(self._errors):.3g}  {loop.updates:,} updates  "
-                f"{loop.counts['late']:,} missed deadlines{trouble}"
+            self._progress.print(f"step {row.step:,}: {self._stage}")
+        if time.monotonic() - self._last >= self.SECONDS and self._errors:
+            self._last = time.monotonic()
+            self._progress.reach(
+                loop.steps - self._begun,
+                error=f"|r - y| {np.mean(self._errors):.3g}",
+                stage=loop.stage,
+                steps=f"{loop.steps:,} steps",
+                updates=f"{loop.updates:,} updates",
+                late=f"{loop.counts['late']:,} missed deadlines",
+                trouble=loop.trouble or "",
             )
 
 

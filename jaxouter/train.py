@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import statistics
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,18 +19,22 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
+from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.plants.sources import add
+from jaxouter.progress import Progress, clock
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.plan import plan
+from jaxouter.training.pretraining import Rehearsal
 from jaxouter.training.run import FORMAT, Run, write_json
-from jaxouter.training.train import NotFiniteError, Row, train
+from jaxouter.training.train import NotFiniteError, Pace, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
+
+LOOK_SECONDS = 5.0  # between two looks at the MAE during the pretraining, at least
 
 
 @dataclass(frozen=True)
@@ -111,18 +116,22 @@ def main(arguments: list[str] | None = None) -> None:
             tensorboard.require()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
         devices.connect(config.devices, processes.check(config.devices))
-        plan(config).check()
-        Fleet.of(config)  # what is left of the checks, before anything is written
-        path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
-        run = Run(Path(path), config)
-        with ExitStack() as stack:
+        with cli.progress(devices.is_first()) as progress, ExitStack() as stack:
+            progress.phase("preparing")
+            planned = plan(config)
+            planned.check()
+            Fleet.of(config)  # what is left of the checks, before anything is written
+            path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
+            run = Run(Path(path), config)
             devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
             try:
-                finals = learn(run, options)
+                finals = learn(run, options, progress, planned.flop)
                 if devices.is_first() and finals is not None:
-                    report(run, finals, begun)
+                    report(run, finals, begun, progress)
             except (OSError, NotFiniteError) as error:
                 raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
+            except KeyboardInterrupt:  # the second one, or after the training
+                finals = None
     if finals is None:
         if devices.is_first():
             print(f"saved; {go_on(run)}", file=sys.stderr)
@@ -134,13 +143,13 @@ def go_on(run: Run) -> str:
     return f"go on with: python -m jaxouter.train --resume {run.path}"
 
 
-def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
+def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, float]) -> dict[int, TrainState] | None:
     """Train with progress, until the end or a signal."""
-    config, trainer = run.config, run.trainer[0]
+    config = run.config
+    progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
+    for name, low, high in config.randomise:
+        progress.print(f"each plant has its own {name}, from {low:g} to {high:g}")
     if devices.is_first():
-        print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
-        for name, low, high in config.randomise:
-            print(f"each plant has its own {name}, from {low:g} to {high:g}")
         for change in run.changes() if options.resume is not None else ():
             print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
     watched = scenarios.get(scenarios.paper_scenarios(config.plant)[0])
@@ -150,28 +159,112 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
         traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
         return {"mae": mae(traces)}
 
-    bars = cli.TrainingProgress(config, trainer.env.plant.y_unit)
-    with cli.Interrupt() as interrupt, bars as progress, closing(tensorboard.Events(run)) as events:
+    shown = Learning(progress, config, watched, flop)
+    stopping = cli.Interrupt("what runs now ends, then everything is saved")
+    with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
         def heard(seed: int, row: Row) -> None:
-            progress(seed, row)
+            shown.epoch(seed, row)
             if options.tensorboard:
                 events(seed, row)
 
-        finals = train(run, watch, heard, lambda: interrupt.requested, progress.pretrained)
+        finals = train(run, watch, heard, lambda: interrupt.requested, shown.pretrained, shown.begins)
+    if finals is not None:
+        shown.end()
     devices.part()
     return finals
 
 
-def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
+class Learning:
+    """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
+
+    def __init__(
+        self, progress: Progress, config: TrainConfig, watched: scenarios.Scenario, flop: tuple[float, float]
+    ) -> None:
+        """Args: watched: what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
+        self._progress, self._config, self._watched = progress, config, watched
+        start, updates = config.pretraining.gradient_steps, config.total_updates
+        self._gradient_steps, self._weights = config.seeds * (start + updates), flop
+        self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))
+        self._done: dict[int, tuple[int, int]] = dict.fromkeys(range(config.seed, config.seed + config.seeds), (0, 0))
+        self._maes: dict[int, str] = {}
+        self._pace, self._what, self._begun = Pace(LOOK_SECONDS), "compiling", time.monotonic()
+        progress.phase(self._what, self._work)
+
+    def begins(self, what: str, done: int, of: int) -> None:
+        """What is going on before gradient steps; so much of it is done."""
+        if what != self._what:
+            slow = counter([self._watched.plant])
+            if slow is not None and what == "recording":
+                self._progress.phase(what, self._config.identification_steps, counter=slow)
+            elif slow is not None and self._what == "recording":
+                self._progress.phase(what, self._work, self._worked())
+            else:
+                self._progress.phase(what)
+            self._what = what
+        self._progress.say(pieces=f"{done} of {of} plants" if of > 1 else "")
+
+    def pretrained(self, seed: int, at: Rehearsal, look: Callable[[], Row]) -> None:
+        """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
+        if self._watched.plant.differentiable:
+            if self._pace.due():
+                self._maes[seed] = cli.number(self._pace.do(look)["mae"])
+        elif math.isfinite(at.best):
+            self._progress.say(cost=f"cost a step on the model {cli.number(-float(at.best), 3)}")
+        self._reached(seed, int(at.done), 0)
+
+    def epoch(self, seed: int, row: Row) -> None:
+        """An epoch has ended; the start counts as one."""
+        self._maes[seed] = cli.number(row["mae"])
+        for name, what in (("skipped", "updates skipped"), ("no_action", "actions not finite")):
+            self._progress.say(**{name: f"{row[name]:.1%} of the {what}" if row.get(name) else ""})
+        self._progress.say(cost="")
+        self._reached(seed, self._config.pretraining.gradient_steps, row["updates"])
+
+    def _reached(self, seed: int, gradient_steps: int, updates: int) -> None:
+        if self._what != "learning":
+            self.begins("learning", 0, 0)
+        self._done[seed] = gradient_steps, updates
+        steps = sum(map(sum, self._done.values()))
+        self._progress.reach(
+            self._worked(), mae=self._mae(), count=f"{steps:,} of {self._gradient_steps:,} gradient steps"
+        )
+
+    def end(self) -> None:
+        """A line that stays, where something has been learned."""
+        steps = sum(map(sum, self._done.values()))
+        if steps:
+            took = clock(time.monotonic() - self._begun)
+            self._progress.print(f"learned in {took}  {self._mae()}  {steps:,} gradient steps")
+
+    def _worked(self) -> float:
+        return sum(n * w for each in self._done.values() for n, w in zip(each, self._weights, strict=True))
+
+    def _mae(self) -> str:
+        if not self._maes:
+            return ""
+        every = self._maes.items() if len(self._done) > 1 else ()
+        found = ", ".join(f"seed {seed} {mae}" for seed, mae in sorted(every)) or next(iter(self._maes.values()))
+        unit = "" if self._watched.plant.y_unit == "1" else f" {self._watched.plant.y_unit}"
+        return f"MAE {found}{unit} on {self._watched.id}"
+
+
+def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, _) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
+    names = [*SIMPLE, *("learned" for _ in finals)]
+    total = sum(work(name, scenario) for name in names for scenario in met)
+    progress.phase("evaluating", total, counter=counter([met[0].plant]))
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
-    simple_results = {name: evaluate(named, met, record_members=True) for name, named in simple.items()}
-    learned = {seed: evaluate(named, met, record_members=True) for seed, named in policies.items()}
+
+    def evaluated(named: Named) -> Results:
+        return evaluate(named, met, True, lambda scenario: progress.advance(work(named.name, scenario)))
+
+    simple_results = {name: evaluated(named) for name, named in simple.items()}
+    learned = {seed: evaluated(named) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     summary = {
@@ -188,24 +281,29 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned, places if run.config.randomise else {})
+    progress.phase("drawing", len(met) + 2)
     main_figure = ""
     with cli.optional("figures"):
-        main_figure = f", main figure {draw(run, met, simple_results, learned[median])}"
-    print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}{main_figure}")
+        main_figure = f", main figure {draw(run, met, simple_results, learned[median], progress.advance)}"
+    progress.print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}{main_figure}")
 
 
-def draw(run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results) -> Path:
-    """Write every figure; returns the main one."""
+def draw(
+    run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results, drawn: Callable[[], None]
+) -> Path:
+    """Write every figure, of each of which `drawn` hears; returns the main one."""
     inner_traces, traces = ({name: t for name, (t, _) in results.items()} for results in (simple["none"], learned))
     for scenario in met:
         name = scenario.id.replace("/", "-")
         figures.response(run.figures / f"{name}.png", scenario, inner_traces[scenario.id], traces[scenario.id])
+        drawn()
     levels = {name: results[met[0].id][1]["mae"] for name, results in simple.items()}
     levels |= {"paper's DRL": met[0].paper[1]} if met[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
     title = f"{met[0].id}, MAE [{met[0].plant.y_unit}]"
     if run.config.epochs:
         figures.learning_curve(run.figures / "learning-curve.png", rows, levels, title)
+        drawn()
     return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
 
 
@@ -215,8 +313,8 @@ def show(
     learned: dict[int, Results],
     places: Mapping[str, str],
 ) -> None:
-    """Print the table; with several seeds the median, least and largest MAE. Places are shown where there are any."""
-    rows = []
+    """Print the table; with several seeds the median, least and largest MAE; places and the paper's figures if any."""
+    rows, of_paper = [], any(scenario.paper for scenario in met)
     for scenario in met:
         of_seeds = [results[scenario.id][1] for results in learned.values()]
         values = [figures["mae"] for figures in of_seeds if figures["mae"] is not None]
@@ -228,10 +326,17 @@ def show(
         inner, static = (simple[name][scenario.id][1]["mae"] for name in ("none", "static"))
         improvement = cli.number(statistics.median(better), 3) if better else "-"
         place = [places[scenario.id]] if places else []
-        rows.append([scenario.id, *place, cli.number(inner), cli.number(static), paper, ours, improvement])
+        printed = [paper] if of_paper else []
+        rows.append([scenario.id, *place, cli.number(inner), cli.number(static), *printed, ours, improvement])
     unit = met[0].plant.y_unit
     columns = ["scenario", *(["plant"] if places else [])]
-    columns += ["inner loop alone", "static prefilter", "paper's DRL", "ours", "improvement, %"]
+    columns += [
+        "inner loop alone",
+        "static prefilter",
+        *(["paper's DRL"] if of_paper else []),
+        "ours",
+        "improvement, %",
+    ]
     cli.table(f"MAE in {unit}", columns, rows)
     if places:
         print("plant: where it lies among those of the training")

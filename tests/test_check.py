@@ -63,3 +63,13 @@ def test_mistakes_are_said(capsys):
         check.main(["nothing"])
     assert end.value.code == 2
     assert "there is no plant 'nothing'" in capsys.readouterr().err
+
+
+def test_no_figure_is_written_unasked(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(check, "response_report", lambda plant, params: lambda figure: figure)
+    check.main(["lag"])
+    assert list(tmp_path.iterdir()) == []
+    assert "figure" not in capsys.readouterr().out
+    check.main(["lag", "--figure", "own.png"])
+    assert "figure: own.png" in capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -75,7 +76,11 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
     ):
         assert text in done.stdout
     assert done.stdout.rstrip().endswith(str(Path("runs") / folder.name / "figures" / "paper.png"))
-    assert "updates (" in done.stdout  # plain lines of progress where there is no terminal
+    begun = [line.split("  ")[0] for line in done.stdout.splitlines()]  # plain lines where there is no terminal
+    phases = ["preparing", "compiling", "learning", "evaluating", "drawing"]
+    assert sorted(phases, key=begun.index) == phases
+    (learned,) = (line for line in done.stdout.splitlines() if line.startswith("learned in "))
+    assert re.search(r"  MAE seed 3 \S+, seed 4 \S+ \w+ on \S+/\S+  240 gradient steps$", learned)
 
 
 def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):
@@ -168,7 +173,12 @@ def test_bad_input_to_train_is_one_message_and_status_2(arguments, text, capsys,
     [
         ([], "say what to evaluate"),
         (["."], "is not a run folder"),
-        (["--policy", "best"], "no policy 'best'; the policies are: none, static"),
+        (["--policy", "best"], "no policy 'best'; it may be FILE.py:CLASS or one of: none, static"),
+        (
+            ["--policy", "nowhere.py:Lead"],
+            "nowhere.py is not a Python file; a policy of your own is named FILE.py:NAME",
+        ),
+        (["--policy", "clairvoyant"], "clairvoyant is a bound, not a policy; python -m jaxouter.compare shows it"),
         (["--policy", "none", "--scenario", "pitch/papers"], "no scenario 'pitch/papers'"),
         (["--policy", "none", "--scenario", "boat/paper"], "no plant 'boat'"),
         (["--policy", "none", "--episodes", "0"], "--episodes is 0; it must be at least 1"),

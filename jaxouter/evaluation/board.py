@@ -26,12 +26,12 @@ import numpy as np
 from jaxouter.evaluation import cache, certificate, scenarios, sweeps
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.metrics import figures_of_merit
-from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS, Kind, identified
+from jaxouter.evaluation.rivals import CLAIRVOYANT, NAMES, RIVALS, Kind, identified
 from jaxouter.evaluation.rivals.clairvoyant import Replay, plan
 from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
-from jaxouter.plants import make
+from jaxouter.plants import Plant, make
 from jaxouter.plants.sources import attribute
 from jaxouter.training.run import Run
 
@@ -41,6 +41,8 @@ LEARNED_NOTE = "The learned outer loop, without exploration."
 TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
 Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
 OWN = "a policy of your own"
+IDENTIFY = {"oracle": 90.0, "inverse": 30.0, "mpc": 60.0, "deepc": 90.0, "pi": 15.0}  # about seconds that it takes
+NEEDS = {"oracle": "differentiable", CLAIRVOYANT: "affine"}  # what the plant must be declared
 PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
 
 
@@ -68,6 +70,13 @@ class Job(NamedTuple):
     on: str = ""  # scenario or sweep
     family_seed: int = scenarios.FAMILY_SEED
 
+    @property
+    def work(self) -> float:
+        """What it takes, in about seconds."""
+        if self.what == "identify":
+            return IDENTIFY.get(self.contender.name, 1.0)
+        return {"meet": 1.0, "sweep": 5.0, "certify": 3.0}[self.what]
+
     def __str__(self) -> str:
         seed = "" if self.contender.seed is None else f" seed {self.contender.seed}"
         return f"{self.what} {self.contender.name}{seed} {self.on}".strip()
@@ -79,6 +88,39 @@ class Done(NamedTuple):
     job: Job
     found: Tuned
     seconds: float
+
+
+def contender(name: str, plant: Plant) -> Contender:
+    """The policy that a command line names: a built-in one, or FILE.py:CLASS.
+
+    Raises:
+        ValueError: there is no such policy or file, or the plant does not allow it.
+    """
+    file, colon, attribute_name = name.rpartition(":")
+    if colon and file.endswith(".py"):
+        attribute(Path(file), attribute_name, OWN)
+        return Contender(f"{Path(file).name}:{attribute_name}", "user", file, None, attribute_name)
+    if name not in NAMES:
+        raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
+    if name not in possible(plant):
+        raise ValueError(f"there is no {name} for {plant.name}, which is not declared {NEEDS[name]}")
+    return Contender(name, "preview" if name == CLAIRVOYANT else RIVALS[name].kind)
+
+
+def possible(plant: Plant) -> list[str]:
+    """The built-in policies that the plant allows."""
+    return [name for name in NAMES if name not in NEEDS or getattr(plant, NEEDS[name])]
+
+
+@contextmanager
+def blamed(name: str, what: str, own: bool = True) -> Iterator[None]:
+    """Turns whatever a user's own policy raises in here into a ValueError that names it."""
+    try:
+        yield
+    except Exception as error:
+        if not own:
+            raise
+        raise ValueError(f"{name} {what}: {type(error).__name__}: {error}") from error
 
 
 @lru_cache(maxsize=64)
@@ -94,10 +136,8 @@ def load(contender: Contender, plant_name: str) -> tuple[Policy, Any]:
         state, _ = run.load(contender.seed or 0)
         return run.trainer[0].policy, run.trainer[0].policy_params(state)
     if contender.kind == "user":
-        try:
+        with blamed(contender.name, "can't be made"):
             policy = attribute(Path(contender.path or ""), contender.attribute, OWN)(plant)
-        except Exception as error:
-            raise ValueError(f"{contender.name} can't be made: {type(error).__name__}: {error}") from error
         return policy, getattr(policy, "params", ())
     return RIVALS[contender.name].build(plant, identified(contender.name, plant_name))
 
@@ -134,7 +174,7 @@ def certify(contender: Contender, plant_name: str, on: str, family_seed: int) ->
     return Tuned({"rows": [row._asdict() for row in rows]}, {}, 0)
 
 
-def run(job: Job, report: Report = lambda text: None) -> Done:
+def run(job: Job, report: Report = lambda text, share: None) -> Done:
     """Do one job.
 
     Raises:
@@ -142,16 +182,14 @@ def run(job: Job, report: Report = lambda text: None) -> Done:
     """
     begin, c = time.perf_counter(), job.contender
     work = {"meet": meet, "sweep": sweep, "certify": certify}.get(job.what)
-    report("begun")
+    report("", 0.0)
     if work is None:
         found = identified(c.name, job.plant, report)
     elif c.kind == "learned":
         found = work(c, job.plant, job.on, job.family_seed)
     elif c.kind == "user":
-        try:
+        with blamed(c.name, f"failed on {job.on}"):
             found = work(c, job.plant, job.on, job.family_seed)
-        except Exception as error:
-            raise ValueError(f"{c.name} failed on {job.on}: {type(error).__name__}: {error}") from error
     else:
         key = {"on": job.on, "family_seed": job.family_seed}
         make_it = partial(work, c, job.plant, job.on, job.family_seed)
@@ -199,7 +237,7 @@ class _Worker:
 
     @classmethod
     def run(cls, job: Job) -> Done:
-        return run(job, lambda text: cls.messages.put(f"{job}: {text}"))
+        return run(job, lambda text, share: cls.messages.put((job, text, share)))
 
 
 @contextmanager
@@ -221,19 +259,21 @@ def _starting() -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
 
 
-def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) -> Iterator[Done]:
+def spread(
+    work: Sequence[Job], initialise: Callable[[], None], report: Callable[[Job, str, float], None]
+) -> Iterator[Done]:
     """The jobs as they get done: on a CPU in a process a core, on an accelerator one after the other.
 
     Args:
         work: jobs; those of a policy begin when its identification, where that is among them, is done.
         initialise: called first in each process; picklable.
-        report: told now and then how far they are.
+        report: told now and then how far each is: what was done, and which share of it that is.
     """
     cores = os.cpu_count() or 1
     alone = cores == 1 or len(work) == 1 or multiprocessing.current_process().daemon  # which may have no children
     if jax.default_backend() != "cpu" or alone:
         for job in work:
-            yield run(job, lambda text, job=job: report(f"{job}: {text}"))
+            yield run(job, partial(report, job))
         return
     context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
     messages = context.SimpleQueue()
@@ -246,7 +286,7 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
             while waiting:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
                 while not messages.empty():
-                    report(messages.get())
+                    report(*messages.get())
                 for future in done:
                     finished = future.result()
                     if finished.job.what == "identify":

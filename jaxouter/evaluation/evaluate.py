@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from jaxouter.evaluation.metrics import figures_of_merit, mae
 from jaxouter.evaluation.rivals import RIVALS, identified
+from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop.policy import Policy, none
-from jaxouter.plants import make
+from jaxouter.plants import Plant, host, make
 
 Results = dict[str, tuple[Traces, dict[str, Any]]]  # by the scenario's id
 
@@ -25,23 +26,41 @@ class Named:
     params: Any
 
 
-def rival(name: str, plant_name: str) -> Named:
+def rival(name: str, plant_name: str, report: Report = lambda text, share: None) -> Named:
     """A rival, identified on the nominal plant unless the cache has it.
 
     Raises:
         ValueError: unknown name; lists those that exist.
     """
-    tuned = identified(name, plant_name)
+    tuned = identified(name, plant_name, report)
     return Named(name, *RIVALS[name].build(make(plant_name)[0], tuned))
 
 
-def evaluate(named: Named, scenarios: Iterable[Scenario], record_members: bool = False) -> Results:
-    """Traces (with the single outputs where asked for) and figures of merit on each scenario."""
+def work(name: str, scenario: Scenario) -> int:
+    """Control steps that `evaluate` takes, for the policy of that name and for the inner loop alone."""
+    return scenario.r.size * (1 if name == "none" else 2)
+
+
+def counter(plants: Iterable[Plant]) -> Callable[[], float] | None:
+    """Control steps that the simulators of plants outside JAX have made so far; None where there are none."""
+    of = getattr(host, "of", lambda plant: None)
+    simulators = list(filter(None, map(of, plants)))
+    return (lambda: sum(each.speed.steps for each in simulators)) if simulators else None
+
+
+def evaluate(
+    named: Named,
+    scenarios: Iterable[Scenario],
+    record_members: bool = False,
+    report: Callable[[Scenario], None] = lambda scenario: None,
+) -> Results:
+    """Traces (with the single outputs where asked for) and figures of merit on each scenario; `report` hears of it."""
     results = {}
     for scenario in scenarios:
         traces = rollout(named.policy, named.params, scenario, record_members)
         inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario, record_members)
         results[scenario.id] = traces, figures_of_merit(traces, scenario, mae(inner))
+        report(scenario)
     return results
 
 

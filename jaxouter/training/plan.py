@@ -26,6 +26,8 @@ class Plan(NamedTuple):
     """Quantity and value, for people."""
     memory: int
     """Bytes, about, without what JAX and compiled functions take."""
+    flop: tuple[float, float]
+    """Of a gradient step of the pretraining, and of an update."""
 
     def check(self) -> None:
         """Raises ValueError where the machine has less memory."""
@@ -75,6 +77,7 @@ def plan(config: TrainConfig) -> Plan:
     # Bits by which the batches of an epoch are drawn, twice.
     drawn = 16 * config.epoch // config.environments * config.updates * config.ddpg.batch_size
     memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more on its way to the disk
+    step = 0.0
     if start.gradient_steps:
         steps = start.episode_steps or trainer.env.plant.episode_steps
         lags = start.lags or observer.history
@@ -90,7 +93,7 @@ def plan(config: TrainConfig) -> Plan:
             ("arithmetic, pretraining", f"{step / 1e6:,.0f} MFLOP each, {step * start.gradient_steps:.2g} FLOP a seed"),
         ]
     lines.append((f"memory in all, {config.seeds} seeds, about", _bytes(memory)))
-    return Plan(lines, memory)
+    return Plan(lines, memory, (step, flop))
 
 
 def _there() -> float:

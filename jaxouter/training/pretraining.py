@@ -57,6 +57,12 @@ class Rehearsal(NamedTuple):
         return cls(carry, carry, jnp.asarray(-np.inf, float), jnp.ones((), float), np.int32(0))
 
 
+Report = Callable[[Rehearsal, Callable[[], Any]], None]
+"""Told now and then how far a rehearsal is, and how to get the actor of that time."""
+Say = Callable[[str, int, int], None]
+"""Told what is going on, recording or compiling, how much of it is done and of how much: 0 of 0 where nobody knows."""
+
+
 class Whitening(NamedTuple):
     """(obs - mean) @ matrix has nearly unit covariance."""
 
@@ -214,9 +220,10 @@ def pretrain(
     policy: LearnedPolicy,
     learned: LearnedParams,
     key: chex.PRNGKey,
-    report: Callable[[Rehearsal], None] = lambda at: None,
+    report: Report = lambda at, actor: None,
     begin: Rehearsal | None = None,
     devices: int = 1,
+    say: Say = lambda what, done, of: None,
 ) -> Any:
     """The actor after so many gradient steps on a plant that is identified from recorded episodes.
 
@@ -227,22 +234,26 @@ def pretrain(
         plant, plant_params: only recorded from, through r~ and y.
         policy, learned: what to begin with; an actor whose first layer takes the whitened observation.
         key: random numbers.
-        report: called now and then with the rehearsal so far.
+        report: called now and then with the rehearsal so far, and with what gives its actor.
         begin: where a rehearsal with the same arguments was stopped; None: at its beginning.
         devices: of this process, which share the episodes of a gradient step.
+        say: called with what is going on.
     """
     key_record, *keys = jax.random.split(key, 3)
     if plant.identified:
-        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin, devices)
+        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin, devices, say)
     lags = config.lags or policy.observer.history
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
-    for key_plant in jax.random.split(key_record, config.plants):
+    for i, key_plant in enumerate(jax.random.split(key_record, config.plants)):
+        say("recording", i, config.plants)
         one = plant_params if plant.draw is None else plant.draw(jax.random.fold_in(key_plant, 1), plant_params)
         data = identify.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    return rehearse(config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices)
+    return rehearse(
+        config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices, say
+    )
 
 
 def rehearse(
@@ -252,9 +263,10 @@ def rehearse(
     policy: LearnedPolicy,
     learned: LearnedParams,
     keys: Sequence[chex.PRNGKey],
-    report: Callable[[Rehearsal], None] = lambda at: None,
+    report: Report = lambda at, actor: None,
     begin: Rehearsal | None = None,
     devices: int = 1,
+    say: Say = lambda what, done, of: None,
 ) -> Any:
     """The actor after so many gradient steps on a differentiable plant, of which each episode is a draw.
 
@@ -264,7 +276,7 @@ def rehearse(
     grows again while that goes well.
 
     Args:
-        config, policy, learned, report, begin, devices: as of `pretrain`.
+        config, policy, learned, report, begin, devices, say: as of `pretrain`.
         plant, plant_params: with the plant's own length of an episode.
         keys: two, of the whitening and of the episodes.
     """
@@ -274,10 +286,17 @@ def rehearse(
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
         schools.append(replace(schools[0], plant=replace(plant, episode_steps=config.episode_steps)))
+    say("compiling", 0, 0)
     white = schools[0].whitening(prior, plant_params, key_white)
     rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
+
+    def actor() -> Any:
+        return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)
+
     while (done := int(at.done)) < config.gradient_steps:
         chunk, school = at.trust * rates[done : done + CHUNK], schools[done >= longer]
+        if done == longer:  # for longer episodes, anew
+            say("compiling", 0, 0)
         found = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
         carry, reward = jax.device_get(found)  # not left on several devices: what comes in so is compiled for anew
         reward = reward[:, 0]
@@ -289,5 +308,5 @@ def rehearse(
             at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), trust, then)
         else:
             at = Rehearsal(at.before, at.before, jnp.asarray(best, float), CUT * at.trust, then)
-        report(at)
-    return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)
+        report(at, actor)
+    return actor()

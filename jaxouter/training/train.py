@@ -6,20 +6,21 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from jaxouter.training import devices
-from jaxouter.training.pretraining import Rehearsal
+from jaxouter.training.pretraining import Rehearsal, Say
 from jaxouter.training.run import Run
 from jaxouter.training.trainer import Trainer, TrainState
 
+T = TypeVar("T")
 Row = dict[str, Any]
 OnEpoch = Callable[[Trainer, TrainState], Row]
 Report = Callable[[int, Row], None]
-Pretrained = Callable[[int, int], None]
+Pretrained = Callable[[int, Rehearsal, Callable[[], Row]], None]
 
 
 class _StoppedError(Exception):
@@ -31,23 +32,25 @@ class NotFiniteError(Exception):
 
 
 class Pace:
-    """How often to save: so that saving takes no more than a share of the time."""
+    """How often to do something: so that it takes no more than a share of the time."""
 
     SHARE = 0.02
 
-    def __init__(self) -> None:
-        self._took, self._ended = 0.0, -math.inf
+    def __init__(self, least: float = 0.0) -> None:
+        """Args: least: seconds between two times, at least; then what the first one takes, compilation, is let pass."""
+        self._least, self._took, self._ended, self._times = least, 0.0, -math.inf, 0
 
     def due(self) -> bool:
         """Whether enough time has passed since the last one."""
-        return time.monotonic() - self._ended >= self._took / self.SHARE
+        return time.monotonic() - self._ended >= max(self._least, self._took / self.SHARE)
 
-    def save(self, what: Callable[[], None]) -> None:
+    def do(self, what: Callable[[], T]) -> T:
         """Do it, and take the time."""
-        begun = time.monotonic()
-        what()
+        begun, self._times = time.monotonic(), self._times + 1
+        found = what()
         self._ended = time.monotonic()
-        self._took = self._ended - begun
+        self._took = 0.0 if self._least and self._times == 1 else self._ended - begun
+        return found
 
 
 def train(
@@ -55,7 +58,8 @@ def train(
     on_epoch: OnEpoch = lambda trainer, state: {},
     report: Report = lambda seed, row: None,
     stop: Callable[[], bool] = lambda: False,
-    pretrained: Pretrained = lambda seed, done: None,
+    pretrained: Pretrained = lambda seed, at, look: None,
+    say: Say = lambda what, done, of: None,
 ) -> dict[int, TrainState] | None:
     """Train every seed of a run to the end, from the newest epoch of which all have a checkpoint, or from the start.
 
@@ -68,7 +72,9 @@ def train(
         on_epoch: called with trainer and state after each epoch; what it returns joins the row (evaluation).
         report: called with seed and row after each epoch (progress).
         stop: asked after each epoch of all seeds whether to end early. All processes end if one does.
-        pretrained: called with seed and gradient steps done as the actor is pretrained (progress).
+        pretrained: called as the actor is pretrained with seed, how far that is, and what gives `on_epoch` of it
+            (progress).
+        say: called with what is going on before (progress).
 
     Returns:
         The final state of each seed, on the host; None where it ended early.
@@ -83,17 +89,22 @@ def train(
     rounds = [run.seeds[i : i + cfg.side_by_side] for i in range(0, cfg.seeds, cfg.side_by_side)]
     pace = Pace()
 
-    def heard(seed: int, at: Rehearsal) -> None:
+    def heard(seed: int, at: Rehearsal, state: Callable[[], TrainState]) -> None:
         stopping = jax.process_count() == 1 and stop()
         if stopping or int(at.done) == cfg.pretraining.gradient_steps or pace.due():
-            pace.save(lambda: run.save_rehearsal(seed, at))
-        pretrained(seed, int(at.done))
+            pace.do(lambda: run.save_rehearsal(seed, at))
         if stopping:
             raise _StoppedError
+        pretrained(seed, at, lambda: on_epoch(trainer, state()))
+
+    def begins(what: str, done_of_it: int, of: int) -> None:
+        if done_of_it and jax.process_count() == 1 and stop():
+            raise _StoppedError
+        say(what, done_of_it, of)
 
     begun = time.perf_counter()
     try:
-        states = {seeds: _begin(run, seeds, done, heard) for seeds in rounds}
+        states = {seeds: _begin(run, seeds, done, heard, begins) for seeds in rounds}
     except _StoppedError:
         return None
 
@@ -121,8 +132,10 @@ def train(
         for seed, state in every_seed():  # what the start gave is the row of epoch 0
             _check(seed, 0, state)
             devices.in_first(partial(keep, seed, state, 0, {}, rates))
-        pace.save(partial(save, 0))
+        pace.do(partial(save, 0))
     for epoch in range(done, cfg.epochs):
+        if epoch == done:
+            say("compiling", 0, 0)
         steps = min(cfg.epoch, cfg.steps - cfg.prefill - epoch * cfg.epoch)
         for seeds in rounds:
             begun = time.perf_counter()
@@ -140,7 +153,7 @@ def train(
                 devices.in_first(partial(keep, seed, state, epoch + 1, found, rates))
         stopping = devices.any_process(stop())
         if devices.any_process(stopping or epoch + 1 == cfg.epochs or (devices.is_first() and pace.due())):
-            pace.save(partial(save, epoch + 1))
+            pace.do(partial(save, epoch + 1))
         if stopping:
             return None
     return {seed: state for seeds in rounds for seed, state in zip(seeds, fleet.take(states[seeds]), strict=True)}
@@ -153,7 +166,13 @@ def _check(seed: int, epoch: int, state: TrainState) -> None:
             raise NotFiniteError(f"seed {seed}, epoch {epoch}: {name.replace('_', ' ')} is not finite any more")
 
 
-def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], None]) -> TrainState:
+def _begin(
+    run: Run,
+    seeds: range,
+    done: int,
+    heard: Callable[[int, Rehearsal, Callable[[], TrainState]], None],
+    say: Say,
+) -> TrainState:
     """States of some seeds after so many epochs: from their checkpoints, or started and prefilled."""
     trainer, params = run.trainer
     like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
@@ -165,7 +184,10 @@ def _begin(run: Run, seeds: range, done: int, heard: Callable[[int, Rehearsal], 
         if loads:
             return run.load(seed, done)[0]
         each = run.config.devices // jax.process_count()
-        return trainer.start(seed, params, lambda at: heard(seed, at), run.load_rehearsal(seed), each)
+        return trainer.start(seed, params, partial(heard, seed), run.load_rehearsal(seed), each, say)
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
-    return states if loads or not run.config.epochs else run.fleet.prefill(states, params)
+    if loads or not run.config.epochs:
+        return states
+    say("prefill", 0, 0)
+    return run.fleet.prefill(states, params)

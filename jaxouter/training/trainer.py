@@ -26,7 +26,7 @@ from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import Rehearsal, pretrain
+from jaxouter.training.pretraining import Rehearsal, Say, pretrain
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
 DIVERGED = FIELDS.index("terminated")
@@ -77,27 +77,35 @@ class Trainer:
         self,
         seed: int,
         params: EnvParams,
-        report: Callable[[Rehearsal], None] = lambda at: None,
+        report: Callable[[Rehearsal, Callable[[], TrainState]], None] = lambda at, state: None,
         begin: Rehearsal | None = None,
         devices: int = 1,
+        say: Say = lambda what, done, of: None,
     ) -> TrainState:
         """State before the prefill.
 
         The static prefilter is identified where the policy is its residual, and the actor pretrained where that is
         configured, on so many devices of this process, from where a rehearsal of the same seed was stopped or from its
-        beginning; `report` is called with the rehearsal so far.
+        beginning; `report` is called with the rehearsal so far, and with what gives the state with its actor; `say`
+        with what is going on.
 
         Raises:
             ValueError: the identification failed.
         """
         key_prior, key = jax.random.split(jax.random.key(seed))
+        say("compiling", 0, 0)
         state = self._fresh(key, params)
         if self.config.residual:
+            say("recording", 0, 0)
             state = state._replace(prior=identify.static(self.env.plant, params.plant, key_prior)[1])
         if self.config.pretraining.gradient_steps:
             key_start = jax.random.fold_in(key_prior, PRETRAINING)
             cfg, plant, learned = self.config.pretraining, self.env.plant, self.policy_params(state)
-            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, report, begin, devices)
+
+            def heard(at: Rehearsal, actor: Callable[[], Any]) -> None:
+                report(at, lambda: state._replace(learner=state.learner._replace(actor=actor())))
+
+            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, heard, begin, devices, say)
             target = jax.tree.map(jnp.copy, actor)  # the state is donated, and no buffer twice
             state = state._replace(learner=state.learner._replace(actor=actor, target_actor=target))
         return state

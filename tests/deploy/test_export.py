@@ -123,7 +123,7 @@ def test_what_deviates_is_not_written(pitch, kind, tmp_path, capsys, monkeypatch
     with pytest.raises(SystemExit, match=r"error: nothing is written: .* are the largest deviations from the policy"):
         pitch.export(kind, tmp_path / f"controller.{kind}")
     assert list(tmp_path.iterdir()) == []
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr().out == "writing\nverifying\n"
 
 
 @pytest.mark.parametrize("kind", ["c", "fmu"])
@@ -161,7 +161,8 @@ def test_command_writes_beside_the_run(pitch):
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, "")
     path = pitch.run.path / "seed-0" / "controller.npz"
-    lines = done.stdout.splitlines()
+    begun, lines = done.stdout.splitlines()[:2], done.stdout.splitlines()[2:]
+    assert begun == ["writing", "verifying"]
     assert lines[0] == (
         "pitch, seed 0: r~ in [-60, 60] crad from r and y in crad, once every 0.1 s; "
         "state: 3 past y, 3 past r~, integral"
@@ -186,7 +187,7 @@ def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
     assert "so name this plant on the command line" in unnamed.stderr
     done = subprocess.run([*arguments, "--plant", TANKS], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, "")
-    told, *_, found = done.stdout.splitlines()
+    _, _, told, *_, found = done.stdout.splitlines()
     assert told.startswith("Tanks, seed 0: r~ in [2, 30] cm from r and y in cm, once every 10 s; ")
     assert found.startswith("verified: ")
     assert "Tanks_outer_loop_step" in (run.path / "controller.h").read_text()

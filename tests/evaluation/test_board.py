@@ -430,12 +430,12 @@ def test_processes_do_what_one_does_and_hand_on_what_fails(monkeypatch, tmp_path
     work = [Job("meet", c, "lag", "lag/steps") for c in (own("Late"), NONE, own("Host"))]
     work += [Job("identify", STATIC, "lag"), Job("certify", NONE, "lag", "lag/steps")]
     said = []
-    doing = board.spread(work, register_lag, said.append)
+    doing = board.spread(work, register_lag, lambda job, text, share: said.append((job, share)))
     spread = {done.job: done for done in (next(doing) for _ in work[1:])}
     (tmp_path / "fail").touch()
     with pytest.raises(ValueError, match=r"own\.py:Late failed on lag/steps: RuntimeError: out of ideas"):
         next(doing)
-    assert {f"{job}: begun" for job in work} <= set(said)
+    assert {(job, 0.0) for job in work} <= set(said)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "another"))
     for job in work[1:]:
         alone = board.run(job)
@@ -473,9 +473,10 @@ def test_processes_do_not_run_the_script_again_that_starts_them_and_are_deaf_to_
 
 def test_one_job_needs_no_other_process(own):
     said = []
-    (done,) = board.spread([Job("meet", own("Jax"), "lag", "lag/steps")], no_process, said.append)
+    job = Job("meet", own("Jax"), "lag", "lag/steps")
+    (done,) = board.spread([job], no_process, lambda *told: said.append(told))
     assert done.found.settings["mae"] > 0
-    assert said == ["meet own.py:Jax lag/steps: begun"]
+    assert said == [(job, "", 0.0)]
 
 
 def no_process() -> None:

@@ -36,8 +36,17 @@ def config():
 def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
     trainer, params = build(config)
     heard = []
-    state = trainer.start(0, params, lambda at: heard.append(int(at.done)))
+    begun, actors = [], []
+
+    def report(at, so_far):
+        heard.append(int(at.done))
+        actors.append(so_far().learner.actor)
+
+    state = trainer.start(0, params, report, say=lambda *what: begun.append(what))
     assert heard == [50, 100]
+    assert list(dict.fromkeys(what for what, _, _ in begun)) == ["compiling", "recording"]
+    jax.tree.map(np.testing.assert_array_equal, actors[-1], state.learner.actor)
+    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, actors), strict=True))
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
@@ -87,10 +96,10 @@ def test_where_the_loop_collapses_training_goes_back_and_on_at_half_the_rate(con
     with monkeypatch.context() as greater:
         greater.setattr(pretraining, "RATE", 100.0)
         heard = []
-        trainer.start(0, params, heard.append)
+        trainer.start(0, params, lambda at, state: heard.append(at))
     assert [float(at.trust) for at in heard] == [0.5, 0.25]
     chex.assert_trees_all_equal(*(x for at in heard for x in (at.before, at.now)))
-    trainer.start(0, params, heard.append, heard[0])
+    trainer.start(0, params, lambda at, state: heard.append(at), heard[0])
     assert float(heard[-1].trust) == 0.5 * 1.25
     chex.assert_trees_all_equal(heard[-1].before, heard[0].now)
 
@@ -133,7 +142,7 @@ def test_a_run_may_end_with_the_start(config, tmp_path):
     assert finals is not None
     assert config.epochs == 0
     assert [row["epoch"] for row in run.rows(0)] == [0]
-    again = train(Run.open(run.path), pretrained=lambda seed, done: pytest.fail("pretrained again"))
+    again = train(Run.open(run.path), pretrained=lambda *_: pytest.fail("pretrained again"))
     jax.tree.map(np.testing.assert_array_equal, finals[0].learner.actor, again[0].learner.actor)
 
 
@@ -142,7 +151,7 @@ def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
     run = Run.create(longer, tmp_path / "run")
     asked = iter([False, False, True])  # two chunks of the start, then the first epoch
     assert train(run, stop=lambda: next(asked)) is None
-    assert train(run, pretrained=lambda seed, done: pytest.fail("pretrained again")) is not None
+    assert train(run, pretrained=lambda *_: pytest.fail("pretrained again")) is not None
     assert [row["epoch"] for row in run.rows(0)] == [0, 1, 2]
 
 
@@ -151,7 +160,7 @@ def test_a_start_that_was_stopped_goes_on_where_it_was(config, tmp_path):
     finals, heard = train(whole), []
     assert train(stopped, stop=lambda: True) is None
     assert (stopped.checkpoints(0), stopped.rows(0)) == ({}, [])
-    resumed = train(Run.open(stopped.path), pretrained=lambda seed, done: heard.append(done))
+    resumed = train(Run.open(stopped.path), pretrained=lambda seed, at, look: heard.append(int(at.done)))
     assert heard == [100]
     chex.assert_trees_all_equal(finals, resumed)
     assert stopped.load_rehearsal(0) is None
@@ -173,7 +182,7 @@ def test_a_damaged_start_begins_anew(config, tmp_path):
     path = run.seed_folder(0) / "pretraining.npz"
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.warns(RunWarning, match=r"pretraining\.npz is not a readable checkpoint"):
-        train(run, pretrained=lambda seed, done: heard.append(done))
+        train(run, pretrained=lambda seed, at, look: heard.append(int(at.done)))
     assert heard == [50, 100]
 
 

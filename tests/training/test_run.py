@@ -145,7 +145,7 @@ def test_saving_takes_no_more_than_its_share(monkeypatch):
     while now[0] < 100.0:
         now[0] += 0.7
         if pace.due():
-            pace.save(save)
+            pace.do(save)
     assert len(saved) == pytest.approx(100 / (0.1 / Pace.SHARE), abs=3)
     assert 0.1 * len(saved) / now[0] < 1.05 * Pace.SHARE
 

@@ -72,8 +72,10 @@ BUDGET = 128_000  # environment steps that identification and tuning of a rival 
 SIMPLE = ("none", "static")  # what costs next to nothing
 
 
-def identified(name: str, plant_name: str, report: Report = lambda text: None) -> Tuned:
+def identified(name: str, plant_name: str, report: Report = lambda text, share: None) -> Tuned:
     """What identification and tuning of a rival found on the nominal plant, once for all: it is kept in the cache.
+
+    `report` is called where it is not there, at the beginning first.
 
     Raises:
         ValueError: there is no such plant or rival, or the identification failed.
@@ -83,6 +85,7 @@ def identified(name: str, plant_name: str, report: Report = lambda text: None) -
     plant, params = make(plant_name)
 
     def tune() -> Tuned:
+        report("", 0.0)
         return RIVALS[name].tune(plant, params, jax.random.key(0), BUDGET, report)
 
     return cache.cached(f"{plant_name}-{name}", {"budget": BUDGET}, tune)

@@ -108,7 +108,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     for i, h in enumerate(tried):
         found = fit(policy, *(jnp.asarray(part, float) for part in data), jnp.asarray(h), key_fit)
         value = score(policy, found, episodes)
-        report(f"{i + 1} of {len(tried)} horizons")
+        report(f"{i + 1} of {len(tried)} horizons", (i + 1) / len(tried))
         best = (value, h, found) if best is None or value > best[0] else best
     assert best is not None
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(best[2]).items()}

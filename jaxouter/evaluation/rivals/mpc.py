@@ -175,7 +175,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     key_record, key_episodes = jax.random.split(key)
     data = record(plant, params, key_record, RECORD)
     horizons = [round(plant.episode_steps * share) for share in (0.1, 0.15, 0.2, 0.3)]
-    report("identifying")
+    report("identifying its model", 0.0)
     arx = identify_model(data, horizons[-1])
     model = innovations_form(arx)
     episodes = training_episodes(plant, params, key_episodes)

@@ -7,6 +7,7 @@ allow; what the learner lacks to it, it lacks by learning. It reads the plant's 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -32,6 +33,7 @@ SEEDS = 3
 BATCH = 64  # episodes a gradient step and seed
 FIRST_STAGE = 1000  # gradient steps; each stage then doubles their number
 STAGES = 3
+MOST = FIRST_STAGE * 2 ** (STAGES - 1)  # gradient steps
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
 DRAWN = 2048  # plants that are simulated beforehand
@@ -56,7 +58,7 @@ def teacher(config: TrainConfig) -> tuple[Teacher, Any]:
     return Teacher.of(config.pretraining, trainer.env.plant, trainer.policy, BATCH), env.plant
 
 
-def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
+def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
     """The limit of a configuration that draws plants: its own pretraining, but on these plants themselves.
 
     Those that respond alike at all times are simulated beforehand. From the cache where it was made before.
@@ -75,8 +77,8 @@ def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
         except ValueError:
             pass  # stepped itself
 
-        def heard(at: Rehearsal) -> None:
-            report(f"gradient step {at.done}")
+        def heard(at: Rehearsal, actor: Callable[[], Any]) -> None:
+            report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
 
         actor = rehearse(start, plant, of_plant, trainer.policy, learned, keys, heard)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
@@ -110,7 +112,8 @@ def train(school: Teacher, params: Any, key: chex.PRNGKey, report: Report) -> Tu
             key_run, key_chunk = jax.random.split(key_run)
             carry, _ = school.train(carry, white, prior, params, rates[i : i + CHUNK], key_chunk)
             jax.block_until_ready(carry)
-            report(f"stage {stage + 1}, gradient step {gradient_steps + i + CHUNK}")
+            done = gradient_steps + i + CHUNK
+            report(f"{done:,} of at most {MOST:,} gradient steps", done / MOST)
         actors, gradient_steps = carry[0], gradient_steps + length
         stages.append(np.asarray(returns(school, fold(actors, white), prior, params, key_test)))
         so_far = [values.max() for values in stages]

@@ -65,6 +65,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     episodes = training_episodes(plant, params, key_episodes)
     policy, time = PI(plant.r_tilde_bounds, plant.control_step), plant.episode_steps * plant.control_step
     spent, each = identify.LEVELS * plant.episode_steps, episodes.r.size
+    most = (budget - spent) // each
     best: list[tuple[float, PIParams]] = []
 
     def gains(x: np.ndarray) -> PIParams:
@@ -74,11 +75,11 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     def loss(x: np.ndarray) -> float:
         tried = gains(x)
         best.append((score(policy, tried, episodes), tried))
-        report(f"{len(best)} tried")
+        report(f"{len(best)} of at most {most} gains", len(best) / most)
         return -best[-1][0] / plant.error_scale if np.isfinite(best[-1][0]) else 1e6
 
     bounds = [(0.0, 5.0), (0.01, 6.0)]
-    options = {"maxfev": (budget - spent) // each, "initial_tr_radius": 0.5, "final_tr_radius": 1e-3}
+    options = {"maxfev": most, "initial_tr_radius": 0.5, "final_tr_radius": 1e-3}
     scipy.optimize.minimize(loss, [0.5, 0.2], method="COBYQA", bounds=bounds, options=options)
     _, found = max(best, key=lambda tried: tried[0])
     settings = {

@@ -18,7 +18,8 @@ from jaxouter.loop.references import redrawn
 from jaxouter.plants import Plant
 
 EPISODES = 16
-Report = Callable[[str], None]
+Report = Callable[[str, float], None]
+"""Told now and then what was done, and which share of the work that is, at least."""
 
 
 def training_episodes(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES) -> Scenario:
@@ -49,7 +50,7 @@ def coordinate_search(
     grid: Mapping[str, Sequence[Any]],
     start: Mapping[str, Any],
     most: int,
-    report: Report = lambda text: None,
+    report: Report = lambda text, share: None,
 ) -> tuple[dict[str, Any], int]:
     """The best settings found by moving one at a time along its grid, until no move helps or `most` were tried.
 
@@ -62,7 +63,7 @@ def coordinate_search(
         key = tuple(settings.values())
         if key not in known and len(known) < most:
             known[key] = score(settings)
-            report(f"{len(known)} settings tried")
+            report(f"{len(known)} of at most {most} settings", len(known) / most)
         return known.get(key, -np.inf)
 
     best = dict(start)

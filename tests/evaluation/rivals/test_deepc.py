@@ -55,7 +55,7 @@ def test_without_noise_it_does_what_mpc_does(past, move_weight, data, steps):
 
 
 def test_tuned_is_within_a_tenth_of_mpc_and_keeps_the_budget(data, steps):
-    tuned = deepc.tune(*lag.make(), KEY, BUDGET, lambda text: None)
+    tuned = deepc.tune(*lag.make(), KEY, BUDGET, lambda text, share: None)
     policy, params = deepc.build(lag.LAG, tuned)
     settings = Settings(**{name: tuned.settings[name] for name in Settings._fields})
     found, expected = rollout(policy, params, steps), rollout(like(settings, data), (), steps)

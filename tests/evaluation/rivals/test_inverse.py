@@ -21,7 +21,7 @@ def tuned():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inverse, "UPDATES", 1_000)
         patch.setattr(inverse, "CANDIDATES", 3)  # 1, 4 and 12
-        return inverse.tune(*lag.make(), KEY, BUDGET, lambda text: None)
+        return inverse.tune(*lag.make(), KEY, BUDGET, lambda text, share: None)
 
 
 def test_horizon_is_that_of_the_first_effect_or_a_bit_more(tuned):

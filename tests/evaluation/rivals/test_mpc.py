@@ -30,7 +30,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def tuned():
-    return mpc.tune(*lag.make(), KEY, BUDGET, lambda text: None)
+    return mpc.tune(*lag.make(), KEY, BUDGET, lambda text, share: None)
 
 
 def true_controller(plant=lag.LAG, **settings):

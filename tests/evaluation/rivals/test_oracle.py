@@ -32,7 +32,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def tuned():
-    return oracle.tune(*lag.make(), KEY, 0, lambda text: None)
+    return oracle.tune(*lag.make(), KEY, 0, lambda text, share: None)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
     plant, params = lag.make()
     episodes = training_episodes(plant, params, jax.random.key(1))
     reached = score(*oracle.build(plant, tuned), episodes)
-    pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text: None)
+    pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text, share: None)
     assert reached > 1.02 * score(*pi.build(plant, pi_tuned), episodes)
     exact = mpc.innovations_form(identify.fit_arx(identify.record(plant, params, KEY, 4), 2, 2))
     for move_weight in (1e-4, 1e-3, 1e-2):
@@ -86,13 +86,13 @@ def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_
     start = PretrainingConfig(gradient_steps=100, batch_size=16)
     config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), residual=True, steps=0)
     said = []
-    found = oracle.retrained(config, said.append)
-    assert said == ["gradient step 50", "gradient step 100"]
+    found = oracle.retrained(config, lambda text, share: said.append((text, share)))
+    assert said == [("50 of 100 gradient steps", 0.5), ("100 of 100 gradient steps", 1.0)]
     trainer, params = build(config)
     episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
     alone = score(*identify.static(*lag.make(), KEY), episodes)
     assert score(trainer.policy, oracle.learned(found), episodes) > 0.85 * alone  # both negative
-    again = oracle.retrained(config, said.append)
+    again = oracle.retrained(config, lambda text, share: said.append((text, share)))
     assert (again.seconds, len(said)) == (found.seconds, 2)
 
 

@@ -33,7 +33,7 @@ def steps():
 
 @pytest.fixture(scope="module")
 def tuned():
-    return pi.tune(*lag.make(), KEY, BUDGET, lambda text: None)
+    return pi.tune(*lag.make(), KEY, BUDGET, lambda text, share: None)
 
 
 def number(value):
@@ -75,7 +75,7 @@ def test_integral_stands_still_only_where_it_would_drive_further_beyond_a_bound(
 @of_single_draws
 def test_tuned_beats_the_static_prefilter_and_twice_the_budget_is_worth_little(tuned):
     plant, params = lag.make()
-    twice = pi.tune(plant, params, KEY, 2 * BUDGET, lambda text: None)
+    twice = pi.tune(plant, params, KEY, 2 * BUDGET, lambda text, share: None)
     episodes = training_episodes(plant, params, jax.random.split(KEY)[1])
     once = score(*pi.build(plant, tuned), episodes)
     assert once > 0.92 * score(*identify.static(plant, params, KEY), episodes)

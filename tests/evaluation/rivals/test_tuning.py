@@ -94,10 +94,11 @@ class Concave:
 @pytest.mark.parametrize("start", [{"a": 1, "b": 3.0, "c": "low"}, {"a": 8, "b": 0.3, "c": "high"}])
 def test_coordinate_search_finds_the_maximum_and_asks_nothing_twice(start):
     value, reports = Concave(), []
-    found, count = coordinate_search(value, GRID, start, 100, reports.append)
+    found, count = coordinate_search(value, GRID, start, 100, lambda text, share: reports.append(share))
     assert found == {"a": 8, "b": 0.3, "c": "high"}
     assert count == len(value.asked) == len(set(value.asked)) == len(reports) < 30
     assert value.asked[0] == tuple(start.values())
+    assert reports == [(i + 1) / 100 for i in range(count)]
 
 
 @pytest.mark.parametrize("most", [0, 1, 4])

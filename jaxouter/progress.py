@@ -1,0 +1,202 @@
+"""What a command is doing, how far it is and how long it still takes: live on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+from rich import progress as bars
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Column
+from rich.text import Text
+
+LINE_SECONDS = 5.0  # between two plain lines, at most
+FIRST = 0.1  # share of the work from which on its first piece tells the pace: smaller ones are mostly compilation
+NARROW = 30  # columns, below which the bar alone shows the share
+
+
+class TimeLeft:
+    """Time left, from the pace so far."""
+
+    def __init__(self, total: float, now: float, done: float = 0.0) -> None:
+        """Args: total: all work, in any unit; now: time, s; done: work that was done before."""
+        self.total, self.done = total, done
+        self._from: tuple[float, float] | None = (now, done)  # time and work from which on the pace is measured
+        self._last: float | None = None  # time of the last piece
+        self._pace: float | None = None  # seconds a unit
+
+    def reach(self, done: float, now: float) -> None:
+        """So much is done."""
+        early = self._last is None and self._pace is None and done - self.done < FIRST * self.total
+        if self._from is None or early:
+            self._from = now, done
+        elif done > self._from[1]:
+            self._pace = (now - self._from[0]) / (done - self._from[1])
+        self.done, self._last = min(done, self.total), now
+
+    def pause(self) -> None:
+        """The time until the next piece is done doesn't count: something else is going on."""
+        self._from = self._last = None
+
+    def left(self, now: float) -> float | None:
+        """Seconds; None where nothing is known yet."""
+        if self._pace is None:
+            return None
+        return max(0.0, self._pace * (self.total - self.done) - (now - (self._last or now)))
+
+
+class Progress:
+    """Phases of a command, one after the other, and a bar with the time left.
+
+    Terminals too narrow for all of it wrap the text and shorten the bar.
+    """
+
+    def __init__(self, console: Console, shown: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
+        """Args: console: where to; shown: False: say nothing (processes but the first); clock: s."""
+        self._console, self._shown, self._clock = console, shown, clock
+        notebook = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
+        self._live = (console.is_terminal and not console.is_dumb_terminal) or notebook
+        self._what, self._said, self._since, self._printed = "", dict[str, str](), clock(), clock()
+        self._work: TimeLeft | None = None
+        self._counter: Callable[[], float] | None = None
+        self._counted, self._before = 0.0, 0.0  # by the counter, and work done, when the last piece was
+        self._ended = threading.Event()
+        share = [bars.TaskProgressColumn()] if console.width >= NARROW else []
+        self._bar = bars.Progress(bars.BarColumn(None), *share, _Time(self), expand=True)
+        self._task = self._bar.add_task("", total=None, start=False)
+        self._display = Live(
+            get_renderable=self._render,
+            console=console,
+            refresh_per_second=4,
+            transient=True,
+            redirect_stderr=sys.stderr is not None and sys.stderr.isatty(),  # else a file gets what is for it
+        )
+
+    def __enter__(self) -> Progress:
+        if not self._shown:
+            return self
+        if self._live:
+            self._display.start()
+        else:
+            threading.Thread(target=self._tick, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._display.stop()
+
+    @property
+    def done(self) -> float:
+        """Work that is done."""
+        return 0.0 if self._work is None else self._before
+
+    def phase(
+        self, what: str, total: float | None = None, done: float = 0.0, counter: Callable[[], float] | None = None
+    ) -> None:
+        """What is going on from now on.
+
+        Args:
+            what: a few words.
+            total: work of a new bar, 0 if nobody knows; None: the bar stays, and the time until it moves doesn't count.
+            done: of that total, before now.
+            counter: work counted since any time, asked now and then: moves the bar within long pieces.
+        """
+        now = self._clock()
+        if total is not None:
+            self._work, self._said, self._before = TimeLeft(total, now, done) if total else None, {}, done
+            self._bar.remove_task(self._task)
+            self._task = self._bar.add_task("", total=total or None, completed=int(done), start=done > 0)
+        elif self._work is not None:
+            self._work.pause()
+        self._what, self._since, self._counter = what, now, counter
+        self._counted = 0.0 if counter is None else counter()
+        if not self._live:
+            self._line()
+
+    def advance(self, work: float = 1.0, **said: str) -> None:
+        """A piece of the work is done; `said` is shown until the next bar, by name."""
+        self.reach(self._before + work, **said)
+
+    def reach(self, done: float, **said: str) -> None:
+        """So much of the work is done; `said` as of `advance`."""
+        self.say(**said)
+        self._before = done
+        if self._counter is not None:
+            self._counted = self._counter()
+        self._move(done)
+
+    def say(self, **said: str) -> None:
+        """What is shown beside the phase until the next bar, by name; an empty text is taken away."""
+        self._said = {name: text for name, text in {**self._said, **said}.items() if text}
+
+    def print(self, text: str) -> None:
+        """A line that stays."""
+        if self._shown:
+            self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=not self._live)
+
+    @property
+    def line(self) -> str:
+        """Everything in one line."""
+        parts = [self._what, *self._said.values()]
+        if self._work is not None and self._work.done:
+            parts.append(f"{100 * self._work.done / self._work.total:.0f} %")
+        begins = not self._said and self._clock() - self._since < 1.0
+        return "  ".join(parts if begins else [*parts, self.time])
+
+    @property
+    def time(self) -> str:
+        """Time left or, where nothing is known yet, elapsed in this phase."""
+        now = self._clock()
+        left = None if self._work is None else self._work.left(now)
+        if left is not None:
+            return f"{clock(left)} left"
+        return f"{clock(now - self._since)} elapsed"
+
+    def _move(self, done: float) -> None:
+        if self._work is not None and done > self._work.done:
+            self._work.reach(done, self._clock())
+            if not self._bar.tasks[0].started:
+                self._bar.start_task(self._task)
+            self._bar.update(self._task, completed=self._work.done)
+
+    def _count(self) -> None:
+        if self._counter is not None:
+            self._move(self._before + self._counter() - self._counted)
+
+    def _render(self) -> Group:
+        self._count()
+        text = Text("  ".join(self._said.values()))
+        return Group(Text.assemble((self._what, "bold"), "  " if text else "", text), self._bar)
+
+    def _tick(self) -> None:
+        """Print a line now and then, until the end."""
+        while not self._ended.wait(LINE_SECONDS / 10):
+            if self._clock() - self._printed >= 0.9 * LINE_SECONDS:
+                self._line()
+
+    def _line(self) -> None:
+        self._count()
+        self._printed = self._clock()
+        self.print(self.line)
+
+
+class _Time(bars.ProgressColumn):
+    """Time left, or elapsed."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__(Column(no_wrap=True))
+        self._progress = progress
+
+    def render(self, task: bars.Task) -> Text:
+        return Text(self._progress.time, justify="right")
+
+
+def clock(seconds: float) -> str:
+    """0:07, 12:34 or 1:02:03."""
+    minutes, whole = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{whole:02d}" if hours else f"{minutes}:{whole:02d}"
