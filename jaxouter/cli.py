@@ -28,6 +28,7 @@ from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
+from jaxouter.loop.identify import IdentificationWarning
 from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.progress import Progress
 from jaxouter.training.config import OWN, PRESETS
@@ -62,6 +63,7 @@ console = Console(
 def user_errors() -> Iterator[None]:
     """A ValueError in here is the user's mistake: one message, exit status 2."""
     warnings.simplefilter("always", RunWarning)
+    warnings.simplefilter("once", IdentificationWarning)
     warnings.showwarning = show
     try:
         yield

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import numpy as np
 import tyro
 
@@ -23,10 +24,12 @@ from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, resu
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.verdict import judge
 from jaxouter.plants.sources import add
 from jaxouter.progress import Progress, clock
 from jaxouter.training import devices, tensorboard
-from jaxouter.training.config import TrainConfig, preset, to_dict
+from jaxouter.training.choice import choose
+from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.plan import plan
 from jaxouter.training.pretraining import Rehearsal
@@ -35,6 +38,7 @@ from jaxouter.training.train import NotFiniteError, Pace, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
 
 LOOK_SECONDS = 5.0  # between two looks at the MAE during the pretraining, at least
+FRESH = 4  # folded into a key
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
         cli.use_compilation_cache()
         config = options.config.check()
         if options.dry_run:
+            config = config if options.resume is not None else chosen(config)
             lines = plan(config).lines
             print(json.dumps(to_dict(config), indent=2))
             return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], lines)
@@ -118,6 +123,7 @@ def main(arguments: list[str] | None = None) -> None:
         devices.connect(config.devices, processes.check(config.devices))
         with cli.progress(devices.is_first()) as progress, ExitStack() as stack:
             progress.phase("preparing")
+            config = config if options.resume is not None else chosen(config)
             planned = plan(config)
             planned.check()
             Fleet.of(config)  # what is left of the checks, before anything is written
@@ -136,6 +142,20 @@ def main(arguments: list[str] | None = None) -> None:
         if devices.is_first():
             print(f"saved; {go_on(run)}", file=sys.stderr)
         raise SystemExit(130)
+
+
+def chosen(config: TrainConfig) -> TrainConfig:
+    """The configuration with what depends on the plant chosen, and told."""
+
+    def choice() -> str:
+        found = choose(config)
+        if found.said is not None:
+            print(f"{config.plant}: {found.said}", flush=True)
+        for warning in found.warnings:
+            cli.show(warning)
+        return json.dumps(to_dict(found.config))
+
+    return from_dict(json.loads(devices.text_from_first(choice)))
 
 
 def go_on(run: Run) -> str:
@@ -251,7 +271,7 @@ class Learning:
 
 def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
-    plant, (trainer, _) = run.config.plant, run.trainer
+    plant, (trainer, params) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
     names = [*SIMPLE, *("learned" for _ in finals)]
     total = sum(work(name, scenario) for name in names for scenario in met)
@@ -267,6 +287,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     learned = {seed: evaluated(named) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
+    key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
+    verdict = judge(trainer.env.plant, params.plant, key, policies, simple)
     summary = {
         "format": FORMAT,
         "median_seed": median,
@@ -276,11 +298,13 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
         "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
         "places": places,
+        "verdict": verdict,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned, places if run.config.randomise else {})
+    progress.print(verdict["text"])
     progress.phase("drawing", len(met) + 2)
     main_figure = ""
     with cli.optional("figures"):

@@ -1,0 +1,111 @@
+"""What observation and model must hold to represent a plant, chosen before training by what a record tells of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxouter import plants
+from jaxouter.loop import identify
+from jaxouter.loop.identify import Dynamics
+from jaxouter.loop.observation import HISTORY
+from jaxouter.plants import Plant
+from jaxouter.training.config import PRESETS, PretrainingConfig, TrainConfig
+
+EXPLORATION = 3  # folded into a key
+
+
+class Choice(NamedTuple):
+    """A configuration in which what depends on the plant is chosen."""
+
+    config: TrainConfig
+    said: str | None  # what was chosen, in a line
+    warnings: tuple[str, ...]
+
+
+def choose(config: TrainConfig) -> Choice:
+    """The configuration with history, lags and length of the recorded episodes chosen by dead time and order.
+
+    They are identified from random r~. What is given stays; so does all of a plant that has presets of its own.
+
+    Raises:
+        ValueError: no r~ moves the output.
+    """
+    if config.plant in PRESETS:
+        return Choice(config, None, ())
+    plant, params = plants.make(config.plant)
+    if plant.identified:
+        return fitted(config, plant, [_of_models(params)], 0)
+    if config.randomise:
+        plant, params = plants.randomised(plant, params, config.randomise)
+    key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
+    found, steps = identify.explore(plant, params, key)
+    if not any(one.shown for one in found):
+        identify.dc_gain(plant, params, key)  # which says so where nothing moves y at all
+        told = f"y of {plant.name} shows no effect of r~ beside its noise in {steps:,} control steps; history stays"
+        return Choice(replace(config, explored_steps=steps), None, (f"{told} {config.history or HISTORY}",))
+    return fitted(config, plant, [one for one in found if one.shown], steps)
+
+
+def _of_models(params: Any) -> Dynamics:
+    """The dynamics of the models that a plant is made of."""
+    a, b = np.asarray(params.model.a), np.asarray(params.model.b)
+    return Dynamics(len(a), int(np.flatnonzero(b)[0]), 0.0, "stable", shown=True)
+
+
+def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int) -> Choice:
+    """The choice for these dynamics, of a plant or of several that are drawn, told by so many control steps."""
+    dead, order = max(one.dead for one in found), max(one.order for one in found)
+    wanted = max(identify.history_for(one.order, one.dead, HISTORY) for one in found)
+    given = plant.history if config.history is None else config.history
+    history, warnings = wanted if given is None else given, []
+    if history <= dead:
+        whose = "--history" if config.history is not None else f"what {plant.name} declares"
+        warnings.append(
+            f"the dead time of {dead} control steps does not fit in the {history} past samples of the observation "
+            f"({whose}), which then can't tell what r~ is under way; set --history {wanted}"
+        )
+    start, warned = _pretraining(config, plant, history if history > dead else wanted, dead)
+    if 2 * dead > plant.episode_steps:
+        warned += (
+            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
+            f"moves y only in the rest; make episodes longer, {4 * dead} control steps or more",
+        )
+    if config.pretraining.lags is None and start.lags == history:
+        start = replace(start, lags=None)
+    settling = max(one.settling for one in found)
+    if plant.episode_steps < settling < np.inf:
+        warned += (
+            f"y takes about {settling:.0f} control steps to settle, longer than an episode of {plant.episode_steps}; "
+            f"make episodes longer, or the control step",
+        )
+    told = [f"dead time {dead} control steps", f"order {order}"]
+    told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
+    chosen = [f"history {history}"] if given is None else []
+    chosen += [f"lags {start.lags}"] if start.lags != config.pretraining.lags else []
+    longer = start.episode_steps != config.pretraining.episode_steps
+    chosen += [f"recorded episodes of {start.episode_steps} control steps"] if longer else []
+    said = f"identified: {', '.join(told)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
+    known = replace(config, explored_steps=steps, pretraining=start)
+    return Choice(known if given is not None else replace(known, history=history), said, (*warnings, *warned))
+
+
+def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
+    """Lags and length of the recorded episodes, of which a model holds at most half; and what is wrong with them."""
+    start = config.pretraining
+    if not start.gradient_steps or plant.identified:
+        return start, ()
+    if start.lags is not None:
+        wrong = f"the dead time of {dead} control steps does not fit in --pretraining.lags {start.lags}; set {lags}"
+        return start, (wrong,) if start.lags <= dead else ()
+    most = (start.episode_steps or plant.episode_steps) // 2
+    if lags > most and start.episode_steps is None and plant.differentiable:
+        return replace(start, lags=lags, episode_steps=2 * lags), ()
+    wrong = (
+        f"the dead time of {dead} control steps does not fit in a model of half a recorded episode, {most} control "
+        f"steps; make episodes longer, {2 * lags} control steps or more"
+    )
+    return replace(start, lags=min(lags, most)), (wrong,) if most <= dead else ()
