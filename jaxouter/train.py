@@ -288,7 +288,9 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
-    verdict = judge(trainer.env.plant, params.plant, key, policies, simple)
+    of_seeds = {seed: named.params for seed, named in policies.items()}
+    affine = {name: named.params for name, named in simple.items()}
+    verdict = judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine)
     summary = {
         "format": FORMAT,
         "median_seed": median,
