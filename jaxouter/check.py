@@ -19,9 +19,12 @@ from jaxouter.loop import identify, log, trust
 from jaxouter.plants import Plant, contract, simulate
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.plants.sources import add
+from jaxouter.training.choice import choose
+from jaxouter.training.config import preset
 
 STEPS = (0.1, 0.25, 0.5)  # moves of r~ up from the middle of its range, as shares of it, and as many down
-MOVED = 1e-3  # of the largest response: y that has moved so far has begun to
+MOVED = 1e-3  # of the largest response soon after: y that has moved so far has begun to
+SOON = 10  # control steps after the beginning, at least
 
 
 @dataclass(frozen=True)
@@ -72,19 +75,40 @@ def log_report(plant: Plant, path: str, figure: Path) -> Path:
 
 def response_report(plant: Plant, params: object, figure: Path) -> Path:
     """How the plant responds to r~, told and drawn."""
-    gain, offset = identify.dc_gain(plant, params, jax.random.key(0))
+    found = identify.dc_gain(plant, params, jax.random.key(0))
     moves, responses = step_responses(plant, params)
-    reached = sorted(float(offset + gain * end) for end in plant.r_tilde_bounds)
+    choice = choose(preset(plant.name))
     lines = [
-        ("DC gain", f"{float(gain):.3g}, y = {float(offset):.3g} {plant.y_unit} at r~ = 0"),
-        ("y within reach", f"{reached[0]:.3g} to {reached[1]:.3g} {plant.y_unit}"),
+        *steady(plant, found),
         ("set-points", f"{plant.setpoint_range[0]:.3g} to {plant.setpoint_range[1]:.3g} {plant.y_unit}"),
         ("dead time", f"{dead_time(responses)} control steps of {plant.control_step:g} {plant.time_unit}"),
+        *([] if choice.said is None else [("training", choice.said)]),
     ]
     cli.table(f"{plant.name}: how it responds", ["what", "is"], [list(line) for line in lines])
-    if reached[0] > plant.setpoint_range[0] or reached[1] < plant.setpoint_range[1]:
+    low, high = within_reach(plant, found)
+    if found.unsettled is None and (low > plant.setpoint_range[0] or high < plant.setpoint_range[1]):
         print("warning: no r~ within its bounds holds y at every set-point", file=sys.stderr)
+    for warning in choice.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     return figures.step_responses(figure, plant, moves, responses)
+
+
+def within_reach(plant: Plant, found: identify.DcGain) -> list[float]:
+    """Least and greatest y that r~ holds, by the DC gain."""
+    return sorted(float(found.offset + found.gain * end) for end in plant.r_tilde_bounds)
+
+
+def steady(plant: Plant, found: identify.DcGain) -> list[tuple[str, str]]:
+    """What y comes to, or does instead."""
+    unit = plant.y_unit
+    if found.unsettled is not None:
+        change = f"by {found.rate:.3g} {unit} a control step for each {unit} of r~ beyond {found.still:.3g}"
+        return [("DC gain", f"none, {found.unsettled.partition(': ')[2]}"), ("y changes late", change)]
+    low, high = within_reach(plant, found)
+    return [
+        ("DC gain", f"{float(found.gain):.3g}, y = {float(found.offset):.3g} {unit} at r~ = 0"),
+        ("y within reach", f"{low:.3g} to {high:.3g} {unit}"),
+    ]
 
 
 def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray]:
@@ -99,9 +123,13 @@ def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray
 
 
 def dead_time(responses: np.ndarray) -> int:
-    """Control steps before any response (n, T) begins, beyond the one of sampling."""
-    begun = np.abs(responses).max(0) > MOVED * np.abs(responses).max()
-    return int(begun.argmax())
+    """Control steps before any response (n, T) begins, beyond the one of sampling.
+
+    It begins where it is no longer small beside what it comes to in twice the time, since it may grow without an end.
+    """
+    largest = np.maximum.accumulate(np.abs(responses).max(0))
+    soon = np.minimum(2 * np.arange(len(largest)) + SOON, len(largest) - 1)
+    return int(np.argmax(largest > MOVED * largest[soon]))
 
 
 if __name__ == "__main__":

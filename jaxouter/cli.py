@@ -23,6 +23,7 @@ from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
+from jaxouter.loop.identify import IdentificationWarning
 from jaxouter.plants.sources import FORMS, Source, add
 from jaxouter.training.config import OWN, PRESETS, TrainConfig
 from jaxouter.training.run import RunWarning
@@ -35,6 +36,7 @@ LINE_SECONDS = 5.0  # between two plain lines of progress
 def user_errors() -> Iterator[None]:
     """A ValueError in here is the user's mistake: one message, exit status 2."""
     warnings.simplefilter("always", RunWarning)
+    warnings.simplefilter("once", IdentificationWarning)
     warnings.showwarning = show
     try:
         yield

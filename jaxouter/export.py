@@ -37,6 +37,8 @@ class Options:
     """onnx, npz, stablehlo, c or fmu."""
     out: Path | None = None
     """File to write, which must not exist; default: controller.FORMAT in the folder."""
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Export what was learned even where the run found it to be worse than r~ = r or the static prefilter."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -83,11 +85,15 @@ def check(options: Options) -> tuple[Path, str, Path]:
         raise ValueError(f"{asked}; the formats are: {', '.join(FORMATS)}")
     out = run / f"controller.{kind}" if options.out is None else options.out
     named = None if options.plant is None else add_plant(options.plant, run)
-    made_on = open_run(run)[0].config.plant
+    opened, seed, _ = open_run(run)
+    made_on = opened.config.plant
     if named not in (None, made_on):
         raise ValueError(f"{run} is a run on {made_on}, not on {named}")
     if out.suffix != f".{kind}":
         raise ValueError(f"--out is {out}; for the format {kind} its name must end in .{kind}")
+    verdict = opened.verdict()
+    if seed in verdict.get("worse", ()) and not options.force:
+        raise ValueError(f"{run}, seed {seed}: {verdict['text']}")
     for path in written(kind, out):
         if path.exists():
             raise ValueError(f"{path} exists; remove it, or choose another --out")

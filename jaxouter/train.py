@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import numpy as np
 import tyro
 
@@ -22,14 +23,19 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.verdict import judge
 from jaxouter.plants.sources import add
 from jaxouter.training import devices, tensorboard
-from jaxouter.training.config import TrainConfig, preset, to_dict
+from jaxouter.training.choice import choose
+from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.plan import plan
 from jaxouter.training.run import FORMAT, Run, write_json
 from jaxouter.training.train import NotFiniteError, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
+
+
+FRESH = 4  # folded into a key
 
 
 @dataclass(frozen=True)
@@ -104,12 +110,14 @@ def main(arguments: list[str] | None = None) -> None:
         cli.use_compilation_cache()
         config = options.config.check()
         if options.dry_run:
+            config = config if options.resume is not None else chosen(config)
             print(json.dumps(to_dict(config), indent=2))
             return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], plan(config).lines)
         if options.tensorboard:
             tensorboard.require()
         processes = Processes(options.coordinator, options.num_processes, options.process_id)
         devices.connect(config.devices, processes.check(config.devices))
+        config = config if options.resume is not None else chosen(config)
         plan(config).check()
         Fleet.of(config)  # what is left of the checks, before anything is written
         path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
@@ -126,6 +134,20 @@ def main(arguments: list[str] | None = None) -> None:
         if devices.is_first():
             print(f"saved; {go_on(run)}", file=sys.stderr)
         raise SystemExit(130)
+
+
+def chosen(config: TrainConfig) -> TrainConfig:
+    """The configuration with what depends on the plant chosen, and told."""
+
+    def choice() -> str:
+        found = choose(config)
+        if found.said is not None:
+            print(f"{config.plant}: {found.said}", flush=True)
+        for warning in found.warnings:
+            cli.show(warning)
+        return json.dumps(to_dict(found.config))
+
+    return from_dict(json.loads(devices.text_from_first(choice)))
 
 
 def go_on(run: Run) -> str:
@@ -164,7 +186,7 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
 
 def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
-    plant, (trainer, _) = run.config.plant, run.trainer
+    plant, (trainer, params) = run.config.plant, run.trainer
     met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
@@ -174,6 +196,8 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     main_figure = draw(run, met, simple_results, learned[median])
+    key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
+    verdict = judge(trainer.env.plant, params.plant, key, policies, simple)
     summary = {
         "format": FORMAT,
         "median_seed": median,
@@ -183,11 +207,13 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
         "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
         "places": places,
+        "verdict": verdict,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
     }
     write_json(run.path / "summary.json", summary)
     show(met, simple_results, learned, places if run.config.randomise else {})
+    print(verdict["text"])
     print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}, main figure {main_figure}")
 
 

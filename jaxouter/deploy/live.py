@@ -24,7 +24,7 @@ from jaxouter.agents import noise
 from jaxouter.agents.ddpg import DDPG, LearnerState
 from jaxouter.agents.replay import Replay, ReplayState
 from jaxouter.deploy.controller import Reason
-from jaxouter.loop import identify, log, rewards
+from jaxouter.loop import identify, rewards
 from jaxouter.loop.environment import Environment
 from jaxouter.loop.identify import Record
 from jaxouter.loop.observation import Memory, Observer, Signals
@@ -283,12 +283,12 @@ class Live:
         if np.ptp(data.r_tilde) == 0.0:
             raise ValueError("r~ has not moved")
         whole, *halves = (_model(Record(*(x[part] for x in data))) for part in (slice(None), *_halves(half)))
-        gains = [log.gain(model) for model in (whole, *halves)]
-        if log.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
+        gains = [identify.gain(model) for model in (whole, *halves)]
+        if identify.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
             told = ", ".join(f"{each:.3g}" for each in gains)
             raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
         dtype = jnp.result_type(float)
-        found = (1.0 / gains[0], -log.offset(whole) / gains[0], whole.a, whole.b)
+        found = (1.0 / gains[0], -identify.offset(whole) / gains[0], whole.a, whole.b)
         slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
         return AffineParams(slope, offset), Response(a, b)
 

@@ -12,7 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import lfilter, lfiltic
 
-from jaxouter.loop.identify import Record, fit_arx
+from jaxouter.loop.identify import (
+    Record,
+    as_model,
+    fit_arx,
+    gain,
+    history_for,
+    kind_of,
+    offset,
+    radius,
+    settling,
+)
 from jaxouter.plants import Plant, arx
 from jaxouter.plants.arx import Model
 from jaxouter.plants.simulators import PlantOptions
@@ -22,12 +32,15 @@ LEAST_ROWS = 200
 JITTER = 1e-3  # by which a step may differ from the others, as share of it
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 EACH = 8  # rows that a coefficient takes at least
-DEAD_TIMES = 40  # control steps, the longest that is tried
+COARSE = 4  # order with which the dead time is searched at first
+NEAR = 20  # control steps on both sides of what it finds, where the other orders are tried
 STRIDE = 4  # with which dead times are searched at first, or half of the order
+EPISODE = (100, 400)  # control steps of an episode of four settling times, unless y does not settle in half of them
+LONGEST_EPISODE = 2_000  # control steps
 FINE = 8  # order up to which a dead time is told to a step; beyond, b covers what lies between
 LONGEST = 2_000  # rows of each third by which order and dead time are chosen
 PARSIMONY = 3e-3  # error of the free run, as share of the standard deviation of y, that a smaller order may cost
-BAND = 0.05  # of the step, for the settling time
+LEAST_HISTORY = 5  # past samples in the observation
 AGREE = 0.9  # of the members must be able to hold a set-point
 
 
@@ -152,21 +165,6 @@ def _check(log: Log) -> None:
             raise ValueError(f"{name} is {column[0]:g} in every row; how y answers to r~ shows only where r~ moves")
 
 
-def radius(model: Model) -> float:
-    """Spectral radius; below 1 the model is stable."""
-    return float(np.max(np.abs(np.roots(np.append(1.0, -model.a))), initial=0.0))
-
-
-def gain(model: Model) -> float:
-    """DC gain."""
-    return float(np.sum(model.b) / (1.0 - np.sum(model.a)))
-
-
-def offset(model: Model) -> float:
-    """Y in steady state under r~ = 0."""
-    return float(model.c / (1.0 - np.sum(model.a)))
-
-
 def free_run(model: Model, log: Log, first: int, rows: int) -> np.ndarray:
     """Y in so many rows from `first` on by the model alone, which knows y before them and r~ throughout; (rows,).
 
@@ -180,18 +178,6 @@ def free_run(model: Model, log: Log, first: int, rows: int) -> np.ndarray:
     return np.asarray(lfilter(delayed, past, log.r_tilde[first : first + rows], zi=known)[0]) + level
 
 
-def step_response(model: Model, steps: int) -> np.ndarray:
-    """Change of x_0 to x_(steps - 1) from a unit step of r~_0 on; (steps,)."""
-    return np.asarray(lfilter(np.append(0.0, model.b), np.append(1.0, -model.a), np.ones(steps)))
-
-
-def settling(model: Model) -> int:
-    """Control steps until the step response stays within 5 % of its end."""
-    tail = math.log(1e-3) / math.log(max(radius(model), 1e-3))
-    off = np.abs(step_response(model, len(model.b) + min(math.ceil(tail), 100_000)) / gain(model) - 1.0)
-    return int(np.max(np.flatnonzero(~(off <= BAND)), initial=-1)) + 1
-
-
 def fit(log: Log, n: int, dead: int, rows: np.ndarray) -> Model:
     """The model by least squares of e.
 
@@ -200,8 +186,7 @@ def fit(log: Log, n: int, dead: int, rows: np.ndarray) -> Model:
         n, dead: order; dead time in control steps beyond the one of sampling.
         rows: (episodes, T + 1), consecutive rows that count.
     """
-    found = fit_arx(Record(log.r_tilde[rows[:, :-1]], log.y[rows]), n, dead)
-    return Model(found.a, np.append(np.zeros(dead), found.b), np.asarray(found.c), np.asarray(found.sigma))
+    return as_model(fit_arx(Record(log.r_tilde[rows[:, :-1]], log.y[rows]), n, dead))
 
 
 def choose(log: Log) -> tuple[int, int]:
@@ -216,18 +201,21 @@ def choose(log: Log) -> tuple[int, int]:
     """
     third = min(len(log.time) // 3, LONGEST)
     rows = len(log.time) // 3 * np.arange(3)[:, None] + np.arange(third)
-    most, slack = min(DEAD_TIMES, third // 4), PARSIMONY * float(np.std(log.y))
+    most = max(third // 4, min(third - EACH * (2 * COARSE + 1) // 2, 3 * third // 4))
+    slack = PARSIMONY * float(np.std(log.y))
+    coarse = {dead: _error(log, rows, COARSE, dead) for dead in range(0, most + 1, STRIDE)}
+    near = min(coarse, key=lambda dead: coarse[dead])
     errors: dict[int, dict[int, float]] = {}  # by order, then dead time
     for n in (n for n in ORDERS if n == 1 or EACH * (2 * n + 1) <= 2 * third):
-        of_n = errors[n] = {dead: _error(log, rows, n, dead) for dead in range(0, most + 1, max(STRIDE, n // 2))}
+        longest = max(0, third - EACH * (2 * n + 1) // 2)  # that leaves rows enough
+        first = max(0, min(near - NEAR, longest))
+        tried = range(first, max(first, min(near + NEAR, most, longest)) + 1, max(STRIDE, n // 2))
+        of_n = errors[n] = {dead: _error(log, rows, n, dead) for dead in tried}
         _look_near(min(of_n, key=lambda dead: of_n[dead]), log, rows, n, of_n, most)
     best = min(min(of_n.values()) for of_n in errors.values())
     enough = 1.01 * best + slack
     if not math.isfinite(enough):
-        raise ValueError(
-            "every model of this log is unstable; r~ must move a loop that comes to rest by itself, and the log must "
-            "show it for many times as long as that takes"
-        )
+        raise ValueError(_unsettled(fit(log, COARSE, near, rows), len(log.time)))
     n = next(n for n, of_n in errors.items() if min(of_n.values()) <= enough)
     late = max(dead for dead, error in errors[n].items() if error <= enough)
     _look_near(late, log, rows, n, errors[n], most)
@@ -274,11 +262,8 @@ def ensemble(log: Log, members: int = 16, seed: int = 0, shape: tuple[int, int] 
     n, dead = choose(log.rows(0, 3 * len(log.time) // 4)) if shape is None else shape
     rows, rng = np.arange(len(log.time)), np.random.default_rng(seed)
     nominal = fit(log, n, dead, rows[None])
-    if radius(nominal) >= 1.0:
-        raise ValueError(
-            "the model of this log is unstable; y must come to rest by itself under a constant r~: if it does, the log "
-            "is too short or drifts"
-        )
+    if kind_of(nominal, len(rows)) != "stable" or settling(nominal) > len(rows):
+        raise ValueError(_unsettled(nominal, len(rows)))
     lead = n + dead
     block = min(max(2 * settling(nominal), 2 * lead), (len(rows) - lead) // 8)
     late = range(max(0, dead - 1), dead + 2) if n <= FINE else (dead,)
@@ -298,6 +283,24 @@ def ensemble(log: Log, members: int = 16, seed: int = 0, shape: tuple[int, int] 
     return Ensemble(n, dead, nominal, tuple(each), redrawn)
 
 
+def _unsettled(model: Model, rows: int) -> str:
+    """Why no plant is made of a log with this model."""
+    found = {
+        "unstable": "the models of this log are unstable",
+        "integrating": "y integrates r~ in this log",
+        "stable": f"y takes longer to settle than the {rows} rows of this log",
+    }[kind_of(model, rows)]
+    return (
+        f"{found}; y must come to rest by itself under a constant r~, and the log must show it many times. If it does, "
+        "the log is too short or drifts; if not, write the plant as FILE.py:NAME"
+    )
+
+
+def without_last_quarter(log: Log, models: Ensemble, seed: int = 0) -> Ensemble:
+    """Models of the same order and dead time, of the first three quarters of the log alone."""
+    return ensemble(log.rows(0, 3 * len(log.time) // 4), len(models.members), seed, (models.order, models.dead))
+
+
 def _padded(model: Model, memory: int) -> Model:
     """With b of so many coefficients."""
     return model._replace(b=np.append(model.b, np.zeros(memory - len(model.b))))
@@ -315,7 +318,9 @@ def _identified(path: Path, stamp: Any, members: int, seed: int) -> tuple[Log, E
     del stamp
     log = read(path)
     try:
-        return log, ensemble(log, members, seed)
+        models = ensemble(log, members, seed)
+        without_last_quarter(log, models, seed)  # what can't be validated is refused here, for all commands alike
+        return log, models
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -355,11 +360,12 @@ def make(name: str, path: str, options: PlantOptions = PlantOptions()) -> tuple[
         raise ValueError("a log tells its control step, and has one r~ and one y; --control-step, --input, --output go")
     log, models = identified(path)
     bounds = options.r_tilde_bounds or (float(log.r_tilde.min()), float(log.r_tilde.max()))
+    settled = settling(models.nominal)
     declared = options.declared(
         r_tilde_bounds=bounds,
         setpoint_range=options.setpoint_range or set_points(log, models, bounds),
         control_step=log.step,
-        episode_steps=min(max(4 * settling(models.nominal), 100), 400),
+        episode_steps=max(min(max(4 * settled, EPISODE[0]), EPISODE[1]), min(2 * settled, LONGEST_EPISODE)),
         y_unit="1",
     )
     span = float(np.ptp(log.y))
@@ -369,7 +375,7 @@ def make(name: str, path: str, options: PlantOptions = PlantOptions()) -> tuple[
         name=name,
         time_unit="s",
         divergence_bounds=(float(log.y.min()) - 2.0 * span, float(log.y.max()) + 2.0 * span),
-        history=min(max(len(models.nominal.b), 5), 20),
+        history=history_for(models.order, models.dead, LEAST_HISTORY),
         family_steps=3 * declared["episode_steps"],
         **declared,
     )

@@ -16,6 +16,9 @@ import jax.numpy as jnp
 from jaxouter.plants import Plant
 
 
+HISTORY = 15  # past samples, where nothing says how many
+
+
 class Memory(NamedTuple):
     """What an outer loop remembers between two control steps."""
 
@@ -50,12 +53,12 @@ class Observer:
 
     @classmethod
     def of(cls, plant: Plant, history: int | None = None, integral_steps: float | None = None) -> Observer:
-        """The observer of a plant; None: the plant's history, a quarter of an episode.
+        """The observer of a plant; None: the plant's history, or 15 where it declares none; a quarter of an episode.
 
         Raises:
             ValueError: history below 1 or integral_steps below 1.
         """
-        history = plant.history if history is None else history
+        history = next(h for h in (history, plant.history, HISTORY) if h is not None)
         integral_steps = plant.episode_steps / 4 if integral_steps is None else integral_steps
         if history < 1 or integral_steps < 1:
             raise ValueError(f"history is {history} and integral_steps is {integral_steps}; both must be at least 1")

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import signal
 
-from jaxouter.loop.log import Ensemble, Log, ensemble, free_run, gain, settling, step_response
+from jaxouter.loop.identify import gain, settling, step_response
+from jaxouter.loop.log import Ensemble, Log, free_run, without_last_quarter
 from jaxouter.plants.arx import Model
 
 Intervals = tuple[tuple[float, float], ...]
@@ -79,7 +80,7 @@ def report(log: Log, models: Ensemble, seed: int = 0) -> Report:
         seed: of blocks and noise.
     """
     cut = 3 * len(log.time) // 4
-    tried = ensemble(log.rows(0, cut), len(models.members), seed, (models.order, models.dead))
+    tried = without_last_quarter(log, models, seed)
     rows = min(len(log.time) - cut, LONGEST_RUN)
     y, told = log.y[cut : cut + rows], free_run(tried.nominal, log, cut, rows)
     one_step = _one_step(tried.nominal, log, cut)

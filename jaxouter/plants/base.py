@@ -70,8 +70,8 @@ class Plant:
     error_scale: float = 0.0
     """Error that counts as one for the learner, in `y_unit`: costs, the price of divergence and rounding are told in
     terms of it, so that no result depends on the unit; 0: a twentieth of the set-point range."""
-    history: int = 15
-    """Default number of past samples of y and r~ in the observation."""
+    history: int | None = None
+    """Past samples of y and r~ in the observation; None: training chooses them by the dead time that it identifies."""
     families: tuple[str, ...] = ("steps", "staircase", "ramps")
     """Reference families of the evaluation, by the names of `jaxouter.loop.references`."""
     family_steps: int = 600

@@ -31,7 +31,7 @@ class PretrainingConfig:
     episode_steps: int | None = None
     """Control steps of a recorded episode, and so of one on the model; None: an episode of the plant."""
     lags: int | None = None
-    """Past samples of r~ and y in the model; None: as many as the observation holds."""
+    """Past samples of r~ and y in the model; None: as many as the observation holds, or as the dead time takes."""
     batch_size: int = 64
     """Episodes of the model a gradient step."""
     noise: float = 0.0
@@ -83,7 +83,7 @@ class TrainConfig:
     epoch: int = 2_000
     """Environment steps an epoch, the unit of progress, evaluation and checkpoints."""
     history: int | None = None
-    """Past samples of y and r~ in the observation; None: what the plant declares."""
+    """Past samples of y and r~ in the observation; None: what the plant declares, or else chosen by its dead time."""
     integral_steps: float | None = None
     """Time constant of the leaky integral, in control steps; None: a quarter of an episode."""
     redraw: float = 0.0
@@ -100,6 +100,8 @@ class TrainConfig:
     """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
     noise_end: float = 1.0
     """Factor on the volatility at the end of training, reached linearly."""
+    explored_steps: Annotated[int, tyro.conf.Suppress] = 0
+    """Control steps of the plant by which the dead time was identified before, to choose what is not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
@@ -192,7 +194,7 @@ class TrainConfig:
         if plant.identified:
             return 0
         recorded = start.episodes * (start.episode_steps or plant.episode_steps) if start.gradient_steps else 0
-        return recorded + (LEVELS * plant.episode_steps if self.residual else 0)
+        return self.explored_steps + recorded + (LEVELS * plant.episode_steps if self.residual else 0)
 
     @property
     def environment_steps(self) -> int:
@@ -320,7 +322,7 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
         ValueError: a field is missing, unknown or of another type.
     """
     # Runs of versions that knew one device only, no pretraining, randomisation or options go on as they were.
-    whole = {"devices": 1, "randomise": (), "plant_options": {}, "pretraining": {}, "ddpg": {}, **values}
+    whole = {"devices": 1, "randomise": (), "explored_steps": 0, "plant_options": {}, "pretraining": {}, "ddpg": {}, **values}
     added_since = {
         "plant_options": dataclasses.asdict(PlantOptions()),
         "pretraining": dataclasses.asdict(PretrainingConfig()),

@@ -260,6 +260,14 @@ class Run:
             seeds = ", ".join(map(str, self.seeds))
             raise ValueError(f"{path} is damaged: it names no median seed of {seeds}") from None
 
+    def verdict(self) -> dict[str, Any]:
+        """What summary.json says of the learned policies on fresh training episodes; nothing before, or if older."""
+        try:
+            found = json.loads((self.path / "summary.json").read_text())["verdict"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
     def rows(self, seed: int) -> list[dict[str, Any]]:
         """Rows of metrics.jsonl, one an epoch; a last one that was not written to its end is none.
 

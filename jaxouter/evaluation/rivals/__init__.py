@@ -39,19 +39,21 @@ def _none(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Rep
 
 
 def _static(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    _, found = identify.static(plant, params, key)
-    settings = {"slope": float(found.slope), "offset": float(found.offset)}
+    identified = identify.dc_gain(plant, params, key)
+    _, found = identify.prefilter(plant, identified)
+    settings = {"slope": float(found.slope), "offset": float(found.offset), "unsettled": identified.unsettled}
     return Tuned(settings, {}, identify.LEVELS * plant.episode_steps)
 
 
 def _affine(plant: Plant, tuned: Tuned) -> tuple[Policy, Any]:
+    identify.warn_unsettled(tuned.settings.get("unsettled"))
     slope, offset = (jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset"))
     return Affine(plant.r_tilde_bounds), AffineParams(slope, offset)
 
 
 RIVALS: dict[str, Rival] = {
     "none": Rival("rival", _none, _affine, "The inner loop alone: r~ = r."),
-    "static": Rival("rival", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes."),
+    "static": Rival("rival", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes; r~ = r without one."),
     "pi": Rival("rival", pi.tune, pi.build, "Static prefilter and PI with anti-windup, gains by COBYQA."),
     "mpc": Rival(
         "rival",

@@ -24,10 +24,10 @@ import jax
 import numpy as np
 
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.rivals.mpc import RECORD
+from jaxouter.evaluation.rivals.mpc import RECORD, horizons_for, late
 from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.rivals.tuning import Report, coordinate_search, score, training_episodes
-from jaxouter.loop.identify import LEVELS, Record, dc_gain, record
+from jaxouter.loop.identify import HORIZON, LEVELS, Record, choose_arx, dc_gain, record
 from jaxouter.plants import Plant
 
 RANK = 1e-6  # singular values below this share of the largest count as zero
@@ -117,17 +117,18 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     key_record, key_episodes = jax.random.split(key)
     data = record(plant, params, key_record, RECORD)
     gain = float(dc_gain(plant, params, key_record).gain)
+    dead = choose_arx(data, round(HORIZON * plant.episode_steps)).dead
     episodes = training_episodes(plant, params, key_episodes)
     spent = data.r_tilde.size + LEVELS * plant.episode_steps
-    horizons = [round(plant.episode_steps * share) for share in (0.1, 0.15, 0.2, 0.3)]
+    horizons, beyond = horizons_for(plant, dead), late(plant, dead)
     grid = {
         "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
         "g_weight": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0),
-        "past": (1, 2, 3, 5, 8, 12, 16, 20),
+        "past": [beyond + past for past in (1, 2, 3, 5, 8, 12, 16, 20)],
         "horizon": horizons,
         "margin": (0.0, 1.0, 2.0, 3.0),
     }
-    start = {"move_weight": 0.1, "g_weight": 1e-2, "past": 12, "horizon": horizons[2], "margin": 1.0}
+    start = {"move_weight": 0.1, "g_weight": 1e-2, "past": beyond + 12, "horizon": horizons[2], "margin": 1.0}
 
     def value(settings: dict[str, Any]) -> float:
         return score(controller(plant, data, gain, Settings(**settings)), (), episodes)

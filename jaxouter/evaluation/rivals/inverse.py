@@ -25,8 +25,8 @@ from jaxouter.agents.adam import adam
 from jaxouter.agents.ddpg import descend
 from jaxouter.agents.networks import Actor
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.rivals.tuning import EPISODES, Report, score, training_episodes
-from jaxouter.loop.identify import Record, record
+from jaxouter.evaluation.rivals.tuning import Report, score, training_episodes
+from jaxouter.loop import identify
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.plants import Plant
 
@@ -100,10 +100,12 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """A network for each of some h, on a record as long as the budget allows; the one with the greatest return."""
     key_record, key_fit, key_episodes = jax.random.split(key, 3)
+    history, explored = identify.suitable_history(plant, params, key_record)
     episodes = training_episodes(plant, params, key_episodes)
     tried = sorted({round(h) for h in np.geomspace(1, plant.episode_steps / 4, CANDIDATES)})
-    data: Record = record(plant, params, key_record, budget // plant.episode_steps - len(tried) * EPISODES)
-    policy = Inverse(Observer.of(plant))
+    spent = explored + len(tried) * episodes.r.size
+    data = identify.record(plant, params, key_record, (budget - spent) // plant.episode_steps)
+    policy = Inverse(Observer.of(plant, history))
     best: tuple[float, int, Any] | None = None
     for i, h in enumerate(tried):
         found = fit(policy, *(jnp.asarray(part, float) for part in data), jnp.asarray(h), key_fit)
@@ -112,11 +114,10 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         best = (value, h, found) if best is None or value > best[0] else best
     assert best is not None
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(best[2]).items()}
-    steps = data.r_tilde.size + len(tried) * episodes.r.size
-    return Tuned({"h": best[1], "updates": UPDATES}, arrays, steps)
+    return Tuned({"h": best[1], "updates": UPDATES, "history": history}, arrays, data.r_tilde.size + spent)
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[Inverse, Any]:
     """The policy from what `tune` found."""
     params = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
-    return Inverse(Observer.of(plant)), params
+    return Inverse(Observer.of(plant, tuned.settings["history"])), params

@@ -18,12 +18,10 @@ import scipy.linalg
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.rivals.tuning import Report, coordinate_search, score, training_episodes
-from jaxouter.loop.identify import ARX, Record, fit_arx, prediction_error, record
+from jaxouter.loop.identify import ARX, HORIZON, choose_arx, record
 from jaxouter.plants import Plant
 
 RECORD = 50  # episodes of the record
-ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
-PARSIMONY = 1e-3  # prediction error, as share of the standard deviation of y, that a smaller order may cost
 NOISE = 1e-3  # of the sensor that the observer expects, standard deviation as share of the range of set-points
 
 
@@ -50,6 +48,15 @@ def innovations_form(arx: ARX) -> Model:
     A = np.eye(size, k=1)
     A[:, 0] = a
     return Model(A, b, np.eye(size)[0], a, arx.c / arx.b.sum())
+
+
+def effect(model: Model, steps: int, horizon: int) -> float:
+    """What a unit step of r~ does to y: the DC gain, or within the horizon where y does not settle in so many steps."""
+    x, y = np.zeros(len(model.B)), np.zeros(max(steps, horizon) + 1)
+    for k in range(len(y)):
+        x, y[k] = model.A @ x + model.B, float(model.C @ x)
+    settles = np.max(np.abs(np.linalg.eigvals(model.A))) < 1.0
+    return model.gain if settles and abs(y[steps] - model.gain) <= 0.5 * abs(model.gain) else float(y[horizon])
 
 
 class Settings(NamedTuple):
@@ -95,8 +102,8 @@ class MPC:
         """In steady state at y_0."""
         p = self.params
         n = len(p.A) - 1
-        settled = np.linalg.solve(np.eye(n) - p.A[:n, :n], p.B[:n])
-        x = settled / float(p.C[:n] @ settled) * y0
+        rest = np.block([[p.A[:n, :n] - np.eye(n), p.B[:n, None]], [p.C[:n], np.zeros(1)]])  # of state and input
+        x = np.linalg.lstsq(rest, np.append(np.zeros(n), y0), rcond=None)[0][:n]
         return Carry(np.append(x, p.d), float(np.clip(y0, *self.r_tilde_bounds)))
 
     def act(self, params: Any, carry: Carry, r: float, y: float, key: Any = None) -> tuple[Carry, float]:
@@ -143,7 +150,7 @@ def controller(plant: Plant, model: Model, sigma: float, settings: Settings) -> 
     reference[:, size] = 1.0
     now, last = np.eye(size + 3)[size + 1], np.eye(size + 3)[size + 2]
     steps = differences(moves.shape[1])
-    weight = settings.move_weight * model.gain**2
+    weight = settings.move_weight * effect(model, plant.episode_steps, horizon) ** 2
     H = forced.T @ forced + weight * steps.T @ steps
     F = forced.T @ (free - reference) - weight * np.outer(steps[0], last)
     rows = limit_rows(plant, free, forced, now, settings.margin * sigma)
@@ -151,32 +158,23 @@ def controller(plant: Plant, model: Model, sigma: float, settings: Settings) -> 
     return MPC(MPCParams(A, B, C, K, model.d, programme), plant.r_tilde_bounds)
 
 
-def identify_model(data: Record, horizon: int) -> ARX:
-    """Order and dead time with the least error of prediction over the horizon on the last quarter of the record.
-
-    Of the orders that predict about as well the smallest is taken, and fitted again to the whole record.
-    """
-    kept = 3 * len(data.y) // 4
-    fitted, held_out = (Record(data.r_tilde[part], data.y[part]) for part in (slice(kept), slice(kept, None)))
-    candidates = [fit_arx(fitted, n, dead) for n in ORDERS for dead in range(data.r_tilde.shape[1] // 20 + 1)]
-    errors = [prediction_error(model, held_out, horizon) for model in candidates]
-    enough = min(errors) * 1.01 + PARSIMONY * float(np.std(held_out.y))
-    best = min((model for model, error in zip(candidates, errors, strict=True) if error <= enough), key=complexity)
-    return fit_arx(data, len(best.a), best.dead)
+def late(plant: Plant, dead: int) -> int:
+    """Control steps of a dead time beyond those that horizons and pasts, as they are chosen else, leave room for."""
+    return max(0, dead - plant.episode_steps // 20)
 
 
-def complexity(model: ARX) -> tuple[int, int]:
-    """Number of coefficients, then dead time."""
-    return len(model.a), model.dead
+def horizons_for(plant: Plant, dead: int) -> list[int]:
+    """Horizons that are tried, in control steps."""
+    return [late(plant, dead) + max(1, round(plant.episode_steps * share)) for share in (0.1, 0.15, 0.2, HORIZON)]
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """Model, then the settings with the greatest return on training episodes."""
     key_record, key_episodes = jax.random.split(key)
     data = record(plant, params, key_record, RECORD)
-    horizons = [round(plant.episode_steps * share) for share in (0.1, 0.15, 0.2, 0.3)]
     report("identifying")
-    arx = identify_model(data, horizons[-1])
+    arx = choose_arx(data, round(HORIZON * plant.episode_steps))
+    horizons = horizons_for(plant, arx.dead)
     model = innovations_form(arx)
     episodes = training_episodes(plant, params, key_episodes)
     most = (budget - data.r_tilde.size) // episodes.r.size

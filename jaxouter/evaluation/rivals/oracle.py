@@ -19,7 +19,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxouter.evaluation.cache import Tuned, cached
 from jaxouter.evaluation.rivals.tuning import Report
-from jaxouter.loop import counterfactual
+from jaxouter.loop import counterfactual, identify
 from jaxouter.loop.identify import LEVELS, static
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant, make
@@ -89,7 +89,9 @@ def retrained(config: TrainConfig, report: Report = lambda text: None) -> Tuned:
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
     del budget
-    return train(teacher(preset(plant.name))[0], params, key, report)
+    history, _ = identify.suitable_history(plant, params, key)
+    found = train(teacher(replace(preset(plant.name), history=history))[0], params, key, report)
+    return found._replace(settings=found.settings | {"history": history})
 
 
 def train(school: Teacher, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
@@ -137,4 +139,5 @@ def learned(tuned: Tuned) -> LearnedParams:
 
 def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
     """The policy from what `tune` found."""
-    return build_trainer(preset(plant.name))[0].policy, learned(tuned)
+    config = replace(preset(plant.name), history=tuned.settings["history"])
+    return build_trainer(config)[0].policy, learned(tuned)

@@ -14,7 +14,7 @@ import scipy.optimize
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.rivals.tuning import Report, score, training_episodes
 from jaxouter.loop import identify
-from jaxouter.loop.identify import static
+from jaxouter.loop.identify import dc_gain, prefilter
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
 
@@ -58,17 +58,23 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
 
     The search runs over asinh of kp G and of ki G times the episode, G the identified DC gain, so that it reaches far
     and is fine near zero; it starts from a gentle controller. The integral acts with the right sign and never quite
-    vanishes: a wrong one can pay within an episode, but drifts away after it.
+    vanishes: a wrong one can pay within an episode, but drifts away after it. Where y does not settle, G is what a unit
+    of r~ moves it by in an episode, and the prefilter is the r~ under which it stays.
     """
     key_static, key_episodes = jax.random.split(key)
-    _, prior = static(plant, params, key_static)
+    identified = dc_gain(plant, params, key_static)
+    _, prior = prefilter(plant, identified)
+    per_gain = float(prior.slope)
+    if identified.unsettled is not None:
+        prior = AffineParams(jnp.zeros(()), jnp.asarray(identified.still, float))
+        per_gain = 1.0 / (identified.rate * plant.episode_steps)
     episodes = training_episodes(plant, params, key_episodes)
     policy, time = PI(plant.r_tilde_bounds, plant.control_step), plant.episode_steps * plant.control_step
     spent, each = identify.LEVELS * plant.episode_steps, episodes.r.size
     best: list[tuple[float, PIParams]] = []
 
     def gains(x: np.ndarray) -> PIParams:
-        scaled = np.sinh(x) * float(prior.slope) / np.array([1.0, time])
+        scaled = np.sinh(x) * per_gain / np.array([1.0, time])
         return PIParams(prior, *(jnp.asarray(gain, float) for gain in scaled))
 
     def loss(x: np.ndarray) -> float:
