@@ -34,7 +34,6 @@ from jaxouter.training.run import FORMAT, Run, write_json
 from jaxouter.training.train import NotFiniteError, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
 
-
 FRESH = 4  # folded into a key
 
 

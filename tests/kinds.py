@@ -54,7 +54,10 @@ def output(params, state):
     return state.y[0]
 
 
-def kind(a: Sequence[float], b: Sequence[float], dead: int = 0, **declared: Any) -> Callable[[], tuple[Plant, Params]]:
+Maker = Callable[[], tuple[Plant, Params]]
+
+
+def kind(a: Sequence[float], b: Sequence[float], dead: int = 0, **declared: Any) -> Maker:
     """A maker of such a plant."""
     fields: dict[str, Any] = dict(
         name="kind",
@@ -81,19 +84,14 @@ def kind(a: Sequence[float], b: Sequence[float], dead: int = 0, **declared: Any)
     return make
 
 
-Lag = kind([POLE], [0.5 * (1 - POLE)])  # DC gain 0.5
+def late(dead: int, **declared: Any) -> Maker:
+    """A lag of DC gain 0.5 with this dead time."""
+    return kind([POLE], [0.5 * (1 - POLE)], dead, **declared)
+
+
 Negative = kind([POLE], [-0.8 * (1 - POLE)])  # DC gain -0.8
 Slow = kind([math.exp(-1 / 500)], [2.0 * (1 - math.exp(-1 / 500))])  # a time constant of five episodes
 Nonminimum = kind([1.6, -0.63], [-0.03, 0.045])  # poles 0.9 and 0.7, zero at 1.5, DC gain 0.5
-Late = kind([POLE], [0.5 * (1 - POLE)], dead=30)  # nearly a third of an episode
+Late = late(30)  # nearly a third of an episode
 Integrating = kind([1.0], [0.04])
 Unstable = kind([1.04], [0.04])
-KINDS = {
-    "Lag": Lag,
-    "Negative": Negative,
-    "Slow": Slow,
-    "Nonminimum": Nonminimum,
-    "Late": Late,
-    "Integrating": Integrating,
-    "Unstable": Unstable,
-}

@@ -30,6 +30,8 @@ FARTHEST = 0.75  # longest dead time that is searched, as share of an episode
 HORIZON = 0.3  # of the predictions by which models are chosen, as share of an episode
 SHOWN = 0.99  # of the prediction error without r~: with r~ it must be smaller, or y does not show it
 DRIFT = 0.08  # of the gain, by which it may still change in a fifth of an episode where y has settled
+NEGLIGIBLE = 0.01  # of the largest coefficient of r~; the first ones below are dead time
+INTEGRATES = 0.05  # distance of a pole from 1, over one divided by the control steps in which nothing shows of it
 STEADY = (0.97, 1.05)  # ratio of the changes in two such fifths, where y grows as that of an integrator does
 ORDER_SEEN = 20  # past samples beyond the dead time that an observation has at most
 BAND = 0.05  # of the step, for the settling time
@@ -230,7 +232,8 @@ def fit_arx(data: Record, n: int, dead: int) -> ARX:
     rows, targets = rows[known], targets[known]
     theta = np.linalg.lstsq(rows, targets, rcond=None)[0]
     residual = targets - rows @ theta
-    return ARX(theta[:n], theta[n : 2 * n], float(theta[-1]), dead, float(np.sqrt(np.mean(residual**2))))
+    sigma = float(np.sqrt(np.mean(residual**2))) if residual.size else math.inf
+    return ARX(theta[:n], theta[n : 2 * n], float(theta[-1]), dead, sigma)
 
 
 def predict(model: ARX, data: Record, horizon: int) -> np.ndarray:
@@ -315,6 +318,7 @@ def dynamics(data: Record) -> Dynamics:
     deaf = fit_arx(data._replace(r_tilde=np.zeros_like(data.r_tilde)), n, dead)
     shown = prediction_error(arx, data, horizon) < SHOWN * prediction_error(deaf, data, horizon)
     kind = kind_of(model, steps)
+    dead += int(np.argmax(np.abs(arx.b) > NEGLIGIBLE * np.abs(arx.b).max()))
     return Dynamics(n, dead, settling(model) if kind == "stable" else math.inf, kind, shown)
 
 
@@ -324,9 +328,7 @@ def kind_of(model: Model, steps: int) -> Literal["stable", "integrating", "unsta
     largest = complex(poles[np.argmax(np.abs(poles))]) if poles.size else 0.0j
     if abs(largest) > 1.0 + 1.0 / steps:
         return "unstable"
-    if abs(largest - 1.0) * steps < 0.05:
-        return "integrating"
-    return "stable" if abs(largest) < 1.0 else "unstable"
+    return "integrating" if abs(largest) >= 1.0 or abs(largest - 1.0) * steps < INTEGRATES else "stable"
 
 
 def explore(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[list[Dynamics], int]:

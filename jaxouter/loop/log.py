@@ -40,6 +40,8 @@ LONGEST_EPISODE = 2_000  # control steps
 FINE = 8  # order up to which a dead time is told to a step; beyond, b covers what lies between
 LONGEST = 2_000  # rows of each third by which order and dead time are chosen
 PARSIMONY = 3e-3  # error of the free run, as share of the standard deviation of y, that a smaller order may cost
+LITTLE = 0.1  # of the moves of y in a step, that a model may leave untold
+ROUNDING = 1e-9  # of a pole, which may be that of an integrator
 LEAST_HISTORY = 5  # past samples in the observation
 AGREE = 0.9  # of the members must be able to hold a set-point
 
@@ -219,7 +221,17 @@ def choose(log: Log) -> tuple[int, int]:
     n = next(n for n, of_n in errors.items() if min(of_n.values()) <= enough)
     late = max(dead for dead, error in errors[n].items() if error <= enough)
     _look_near(late, log, rows, n, errors[n], most)
-    return n, max(dead for dead, error in errors[n].items() if error <= enough)
+    late = max(dead for dead, error in errors[n].items() if error <= enough)
+    _must_be_best(fit(log, n, late, rows), log, rows, most)
+    return n, late
+
+
+def _must_be_best(chosen: Model, log: Log, rows: np.ndarray, most: int) -> None:
+    """Raises ValueError where models that are not stable, which can't run freely, tell far more a step ahead."""
+    if chosen.sigma > LITTLE * np.std(np.diff(log.y)):
+        best = min((fit(log, COARSE, dead, rows) for dead in range(0, most + 1, STRIDE)), key=lambda model: model.sigma)
+        if best.sigma < chosen.sigma / 2.0 and kind_of(best, len(log.time)) != "stable":
+            raise ValueError(_unsettled(best, len(log.time)))
 
 
 def _look_near(dead: int, log: Log, rows: np.ndarray, n: int, errors: dict[int, float], most: int) -> None:
@@ -234,7 +246,7 @@ def _error(log: Log, rows: np.ndarray, n: int, dead: int) -> float:
     total = 0.0
     for i, held_out in enumerate(rows):
         model, first = fit(log, n, dead, np.delete(rows, i, 0)), held_out[0] + n + dead
-        if radius(model) >= 1.0:
+        if radius(model) > 1.0 - ROUNDING:
             return math.inf
         y = log.y[first : held_out[-1] + 1]
         total += float(np.mean((y - free_run(model, log, first, len(y))) ** 2)) / len(rows)
@@ -262,7 +274,7 @@ def ensemble(log: Log, members: int = 16, seed: int = 0, shape: tuple[int, int] 
     n, dead = choose(log.rows(0, 3 * len(log.time) // 4)) if shape is None else shape
     rows, rng = np.arange(len(log.time)), np.random.default_rng(seed)
     nominal = fit(log, n, dead, rows[None])
-    if kind_of(nominal, len(rows)) != "stable" or settling(nominal) > len(rows):
+    if kind_of(nominal, len(rows)) != "stable" or (shape is None and settling(nominal) > len(rows)):
         raise ValueError(_unsettled(nominal, len(rows)))
     lead = n + dead
     block = min(max(2 * settling(nominal), 2 * lead), (len(rows) - lead) // 8)
@@ -288,7 +300,7 @@ def _unsettled(model: Model, rows: int) -> str:
     found = {
         "unstable": "the models of this log are unstable",
         "integrating": "y integrates r~ in this log",
-        "stable": f"y takes longer to settle than the {rows} rows of this log",
+        "stable": f"y does not settle within the {rows} rows of this log",
     }[kind_of(model, rows)]
     return (
         f"{found}; y must come to rest by itself under a constant r~, and the log must show it many times. If it does, "

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 
 from jaxouter.plants import Plant
 
-
 HISTORY = 15  # past samples, where nothing says how many
 
 

@@ -13,7 +13,7 @@ from jaxouter.loop import identify
 from jaxouter.loop.identify import Dynamics
 from jaxouter.loop.observation import HISTORY
 from jaxouter.plants import Plant
-from jaxouter.training.config import PRESETS, TrainConfig
+from jaxouter.training.config import PRESETS, PretrainingConfig, TrainConfig
 
 EXPLORATION = 3  # folded into a key
 
@@ -58,44 +58,47 @@ def _of_models(params: Any) -> Dynamics:
 
 def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int) -> Choice:
     """The choice for these dynamics, of a plant or of several that are drawn, told by so many control steps."""
-    start, dead, order = config.pretraining, max(one.dead for one in found), max(one.order for one in found)
+    dead, order = max(one.dead for one in found), max(one.order for one in found)
     wanted = max(identify.history_for(one.order, one.dead, HISTORY) for one in found)
     given = plant.history if config.history is None else config.history
-    warnings = []
-    changed = {} if given is not None else {"history": wanted}
-    if given is not None and given <= dead:
-        declared = "--history" if config.history is not None else f"what {plant.name} declares"
+    history, warnings = wanted if given is None else given, []
+    if history <= dead:
+        whose = "--history" if config.history is not None else f"what {plant.name} declares"
         warnings.append(
-            f"the dead time of {dead} control steps does not fit in the {given} past samples of the observation "
-            f"({declared}), so r~ that is under way can't be seen; set --history {wanted}"
+            f"the dead time of {dead} control steps does not fit in the {history} past samples of the observation "
+            f"({whose}), which then can't tell what r~ is under way; set --history {wanted}"
         )
-    lags = start.lags or (wanted if given is None or given <= dead else given)
-    recorded = start.episode_steps or plant.episode_steps
-    if start.gradient_steps and not plant.identified:
-        if start.lags is not None and lags <= dead:
-            warnings.append(
-                f"the dead time of {dead} control steps does not fit in a model of {lags} lags; set "
-                f"--pretraining.lags {wanted}"
-            )
-        elif 2 * lags > recorded and start.episode_steps is None and plant.differentiable:
-            recorded = 2 * lags
-            start = replace(start, episode_steps=recorded)
-        elif 2 * lags > recorded and start.lags is None:
-            lags = max(1, recorded // 2)
-            if lags <= dead:
-                warnings.append(
-                    f"the dead time of {dead} control steps does not fit in a model of {lags} lags, half a recorded "
-                    f"episode; make episodes longer, at least {2 * wanted} control steps"
-                )
-        if lags != (changed.get("history") or given):
-            start = replace(start, lags=lags)
+    start, warned = _pretraining(config, plant, history if history > dead else wanted, dead)
     if 2 * dead > plant.episode_steps:
-        warnings.append(
-            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, of which "
-            f"r~ moves only the rest; make episodes longer, at least {4 * dead} control steps"
+        warned += (
+            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
+            f"moves y only in the rest; make episodes longer, {4 * dead} control steps or more",
         )
-    settled = "" if not 0.0 < max(one.settling for one in found) < np.inf else f", settling time {max(one.settling for one in found):.0f}"
-    said = f"identified: dead time {dead} control steps, order {order}{settled}; history {changed.get('history', given)}"
-    said += "" if start.lags is None else f", lags {start.lags}"
-    said += "" if start.episode_steps == config.pretraining.episode_steps else f", recorded episodes {recorded}"
-    return Choice(replace(config, explored_steps=steps, pretraining=start, **changed), said, tuple(warnings))
+    settling = max(one.settling for one in found)
+    told = [f"dead time {dead} control steps", f"order {order}"]
+    told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
+    chosen = [f"history {history}"] if given is None else []
+    chosen += [f"lags {start.lags}"] if start.lags != config.pretraining.lags else []
+    longer = start.episode_steps != config.pretraining.episode_steps
+    chosen += [f"recorded episodes of {start.episode_steps} control steps"] if longer else []
+    said = f"identified: {', '.join(told)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
+    known = replace(config, explored_steps=steps, pretraining=start)
+    return Choice(known if given is not None else replace(known, history=history), said, (*warnings, *warned))
+
+
+def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
+    """Lags and length of the recorded episodes, of which a model holds at most half; and what is wrong with them."""
+    start = config.pretraining
+    if not start.gradient_steps or plant.identified:
+        return start, ()
+    if start.lags is not None:
+        wrong = f"the dead time of {dead} control steps does not fit in --pretraining.lags {start.lags}; set {lags}"
+        return start, (wrong,) if start.lags <= dead else ()
+    most = (start.episode_steps or plant.episode_steps) // 2
+    if lags > most and start.episode_steps is None and plant.differentiable:
+        return replace(start, lags=lags, episode_steps=2 * lags), ()
+    wrong = (
+        f"the dead time of {dead} control steps does not fit in a model of half a recorded episode, {most} control "
+        f"steps; make episodes longer, {2 * lags} control steps or more"
+    )
+    return replace(start, lags=min(lags, most)), (wrong,) if most <= dead else ()

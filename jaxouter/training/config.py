@@ -322,7 +322,15 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
         ValueError: a field is missing, unknown or of another type.
     """
     # Runs of versions that knew one device only, no pretraining, randomisation or options go on as they were.
-    whole = {"devices": 1, "randomise": (), "explored_steps": 0, "plant_options": {}, "pretraining": {}, "ddpg": {}, **values}
+    whole = {
+        "devices": 1,
+        "randomise": (),
+        "explored_steps": 0,
+        "plant_options": {},
+        "pretraining": {},
+        "ddpg": {},
+        **values,
+    }
     added_since = {
         "plant_options": dataclasses.asdict(PlantOptions()),
         "pretraining": dataclasses.asdict(PretrainingConfig()),

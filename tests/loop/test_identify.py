@@ -19,14 +19,14 @@ KEY = jax.random.key(0)
 
 
 def test_dc_gain_of_pitch_is_a_third_without_offset() -> None:
-    gain, offset = identify.dc_gain(*make("pitch"), KEY)
+    gain, offset, *_ = identify.dc_gain(*make("pitch"), KEY)
     assert float(gain) == pytest.approx(1 / 3, rel=0.01)
     assert float(offset) == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("K", [0.5, -2.0])
 def test_dc_gain_of_a_lag_is_exact(K: float) -> None:
-    gain, offset = identify.dc_gain(*lag.make(K=K, T=0.2), KEY)
+    gain, offset, *_ = identify.dc_gain(*lag.make(K=K, T=0.2), KEY)
     assert float(gain) == pytest.approx(K, rel=1e-5)
     assert float(offset) == pytest.approx(0.0, abs=1e-5)
 
@@ -34,7 +34,7 @@ def test_dc_gain_of_a_lag_is_exact(K: float) -> None:
 def test_offset_is_found() -> None:
     plant, params = lag.make(K=0.5, T=0.2)
     raised = dataclasses.replace(plant, output=lambda params, state: state.y + 3.0)
-    gain, offset = identify.dc_gain(raised, params, KEY)
+    gain, offset, *_ = identify.dc_gain(raised, params, KEY)
     assert float(gain) == pytest.approx(0.5, rel=1e-5)
     assert float(offset) == pytest.approx(3.0, rel=1e-5)
 

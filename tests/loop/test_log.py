@@ -14,11 +14,11 @@ import pytest
 from pyarrow import parquet
 
 from jaxouter import plants
-from jaxouter.loop import environment
+from jaxouter.loop import environment, identify
 from jaxouter.loop import log as logs
 from jaxouter.loop.log import Log
 from jaxouter.plants.simulators import PlantOptions
-from tests import lag
+from tests import kinds, lag
 from tests.logs import recorded, write
 from tests.precision import of_single_draws
 
@@ -125,20 +125,20 @@ def test_a_clean_log_gives_the_lag_exactly(clean: Log) -> None:
     models = logs.ensemble(clean)
     assert (models.order, models.dead) == (2, 2)
     for model in (models.nominal, *models.members):
-        assert logs.gain(model) == pytest.approx(0.5, abs=1e-5)
-        assert logs.offset(model) == pytest.approx(0.0, abs=1e-5)
-        np.testing.assert_allclose(logs.step_response(model, 40), step_of_lag(40), atol=1e-5)
-    assert logs.settling(models.nominal) == 12  # 0.25 s + 3 T = 1.15 s
+        assert identify.gain(model) == pytest.approx(0.5, abs=1e-5)
+        assert identify.offset(model) == pytest.approx(0.0, abs=1e-5)
+        np.testing.assert_allclose(identify.step_response(model, 40), step_of_lag(40), atol=1e-5)
+    assert identify.settling(models.nominal) == 12  # 0.25 s + 3 T = 1.15 s
 
 
 def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: Log) -> None:
     """The noise is 5 % of the standard deviation of y."""
     models = logs.ensemble(noisy)
-    gains = [logs.gain(model) for model in models.members]
-    assert logs.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
+    gains = [identify.gain(model) for model in models.members]
+    assert identify.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
     assert abs(models.dead - 2) <= 1
     assert 1e-4 < np.std(gains) < 0.01
-    np.testing.assert_allclose(logs.step_response(models.nominal, 40), step_of_lag(40), atol=0.03)
+    np.testing.assert_allclose(identify.step_response(models.nominal, 40), step_of_lag(40), atol=0.03)
     assert models.redrawn == 0
     again = logs.ensemble(noisy)
     jax.tree.map(np.testing.assert_array_equal, again, models)
@@ -148,11 +148,45 @@ def test_pitch_is_identified_from_its_log() -> None:
     plant, params = plants.make("pitch")
     log = recorded(plant, params, rows=2_000, redraw=0.03)
     models = logs.ensemble(log, members=2)
-    assert logs.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
+    assert identify.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
     assert models.dead == 5  # 0.5 s
     base = np.zeros(150)
     true = np.asarray(plants.simulate(plant, params, base + 1.0, KEY) - plants.simulate(plant, params, base, KEY))
-    np.testing.assert_allclose(logs.step_response(models.nominal, 151)[1:], true, atol=3e-3)
+    np.testing.assert_allclose(identify.step_response(models.nominal, 151)[1:], true, atol=3e-3)
+
+
+@pytest.mark.parametrize(("dead", "rows"), [(70, 600), (90, 1_200)])
+def test_a_long_dead_time_is_found(dead: int, rows: int) -> None:
+    log = recorded(*kinds.late(dead)(), rows=rows, noise=0.01)
+    models = logs.ensemble(log, members=2)
+    assert models.dead == dead
+    assert identify.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
+
+
+def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_settle(tmp_path: Path) -> None:
+    file = write(tmp_path / "late.csv", recorded(*kinds.late(90)(), rows=1_200))
+    plant, _ = logs.make("late", str(file))
+    assert plant.history == 90 + 2
+    assert plant.episode_steps == 400
+    slow = recorded(*kinds.kind([math.exp(-1 / 100)], [0.005])(), rows=1_500)
+    plant, _ = logs.make("slow", str(write(tmp_path / "slow.csv", slow)))
+    assert plant.episode_steps == 2 * 300  # 95 % of a step after three time constants
+
+
+@pytest.mark.parametrize(("plant", "words"), [(kinds.Integrating, "y integrates r~"), (kinds.Unstable, "are unstable")])
+def test_all_commands_refuse_alike_what_does_not_settle(tmp_path: Path, plant: kinds.Maker, words: str) -> None:
+    log = recorded(*plant(), rows=400)
+    with pytest.raises(ValueError, match=words):
+        logs.ensemble(log)
+    with pytest.raises(ValueError, match=words):  # `check` and `train` both make the plant, and see this alone
+        logs.make("log", str(write(tmp_path / "log.csv", log)))
+
+
+def test_what_cannot_be_validated_is_refused_before_it_is_a_plant(tmp_path: Path, clean: Log) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logs, "without_last_quarter", lambda *_: logs.ensemble(clean, members=1))
+        with pytest.raises(ValueError, match="members is 1"):
+            logs.make("log", str(write(tmp_path / "log.csv", clean)))
 
 
 def test_free_run_continues_from_what_was_recorded(clean: Log) -> None:
@@ -234,6 +268,6 @@ def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: Log) -
 def test_an_error_of_identification_names_the_file(tmp_path: Path) -> None:
     t = 0.1 * np.arange(300)
     file = write(tmp_path / "away.csv", Log(t, np.sin(t), np.exp(0.05 * np.arange(300))))
-    with pytest.raises(ValueError, match=r"away\.csv: every model of this log is unstable"):
+    with pytest.raises(ValueError, match=r"away\.csv: the models of this log are unstable"):
         logs.make("log", str(file))
     assert math.isfinite(logs.read(file).step)

@@ -53,7 +53,9 @@ def _affine(plant: Plant, tuned: Tuned) -> tuple[Policy, Any]:
 
 RIVALS: dict[str, Rival] = {
     "none": Rival("rival", _none, _affine, "The inner loop alone: r~ = r."),
-    "static": Rival("rival", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes; r~ = r without one."),
+    "static": Rival(
+        "rival", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes; r~ = r without one."
+    ),
     "pi": Rival("rival", pi.tune, pi.build, "Static prefilter and PI with anti-windup, gains by COBYQA."),
     "mpc": Rival(
         "rival",

@@ -1,0 +1,74 @@
+"""Whether what was learned is said to be worse than doing nothing."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from jaxouter import export, plants
+from jaxouter.evaluation.evaluate import Named
+from jaxouter.evaluation.verdict import judge
+from jaxouter.loop.policy import Affine, AffineParams
+from jaxouter.training.run import Run
+from tests import kinds
+from tests.training.small import small
+
+PLANT, PARAMS = kinds.late(3)()
+
+
+def affine(name: str, slope: float) -> Named:
+    return Named(name, Affine(PLANT.r_tilde_bounds), AffineParams(jnp.asarray(slope), jnp.zeros(())))
+
+
+SIMPLE = {"none": affine("none", 1.0), "static": affine("static", 2.0)}
+
+
+def judged(**slopes: float) -> dict[str, Any]:
+    """The verdict on affine policies by seed; with a DC gain of 0.5 a slope of 2 is right."""
+    policies = {int(seed[1:]): affine("learned", slope) for seed, slope in slopes.items()}
+    return judge(PLANT, PARAMS, jax.random.key(5), policies, SIMPLE)
+
+
+def test_the_best_is_said_to_be() -> None:
+    found = judged(s0=2.0)
+    assert found["worse"] == []
+    assert found["mae"]["learned"]["0"] == found["mae"]["static"] < found["mae"]["none"]
+    assert found["text"].startswith("verdict: on 16 fresh training episodes what was learned is the best; MAE: learned")
+
+
+def test_what_is_worse_than_doing_nothing_is_named_by_seed() -> None:
+    found = judged(s3=2.0, s4=-1.0)
+    assert found["worse"] == [4]
+    assert "what was learned by seed 4 is worse than static; MAE: learned" in found["text"]
+    assert "export asks for --force" in found["text"]
+    json.dumps(found, allow_nan=False)
+
+
+def test_what_diverges_is_worse() -> None:
+    found = judged(s0=float("nan"))
+    assert (found["worse"], found["mae"]["learned"]["0"]) == ([0], None)
+    assert "learned diverged" in found["text"]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch) -> Run:
+    monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(3))
+    return Run.create(small("kind"), tmp_path / "run")
+
+
+def test_export_refuses_what_is_worse_unless_forced(run: Run) -> None:
+    summary = run.path / "summary.json"
+    options = export.Options(run.path, format="npz")
+    for older in ({}, {"verdict": {"worse": [], "text": ""}}):
+        summary.write_text(json.dumps({"median_seed": 0} | older))
+        assert export.check(options)[0] == run.path
+    summary.write_text(json.dumps({"median_seed": 0, "verdict": {"worse": [0], "text": "worse than none"}}))
+    with pytest.raises(ValueError, match="seed 0: worse than none"):
+        export.check(options)
+    assert export.check(export.Options(run.path, format="npz", force=True))[0] == run.path
+    summary.write_text("{")
+    assert run.verdict() == {}
