@@ -31,6 +31,11 @@ class State(NamedTuple):
     r_tilde: jax.Array  # (m,)
 
 
+def key(seed):
+    """A random key."""
+    return jax.random.key(seed)
+
+
 def init(key, params):
     """Everything zero."""
     return State(jnp.zeros_like(params.a), jnp.zeros_like(params.b))

@@ -74,6 +74,8 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
             f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
             f"moves y only in the rest; make episodes longer, {4 * dead} control steps or more",
         )
+    if config.pretraining.lags is None and start.lags == history:
+        start = replace(start, lags=None)
     settling = max(one.settling for one in found)
     told = [f"dead time {dead} control steps", f"order {order}"]
     told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []

@@ -164,11 +164,11 @@ def test_a_long_dead_time_is_found(dead: int, rows: int) -> None:
 
 
 def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_settle(tmp_path: Path) -> None:
-    file = write(tmp_path / "late.csv", recorded(*kinds.late(90)(), rows=1_200))
+    file = write(tmp_path / "late.csv", recorded(*kinds.late(90)(), rows=800))
     plant, _ = logs.make("late", str(file))
     assert plant.history == 90 + 2
     assert plant.episode_steps == 400
-    slow = recorded(*kinds.kind([math.exp(-1 / 100)], [0.005])(), rows=1_500)
+    slow = recorded(*kinds.kind([math.exp(-1 / 100)], [0.005])(), rows=900)
     plant, _ = logs.make("slow", str(write(tmp_path / "slow.csv", slow)))
     assert plant.episode_steps == 2 * 300  # 95 % of a step after three time constants
 

@@ -63,7 +63,7 @@ def test_lags_that_are_given_stay_with_a_warning() -> None:
 def test_episodes_are_recorded_longer_where_a_model_needs_it() -> None:
     plant = replace(PLANT, episode_steps=80)
     choice = fitted(CONFIG, plant, [LATE], 0)
-    assert (choice.config.pretraining.lags, choice.config.pretraining.episode_steps) == (43, 86)
+    assert (choice.config.history, choice.config.pretraining.episode_steps) == (43, 86)
     assert "recorded episodes of 86 control steps" in str(choice.said)
     elsewhere = fitted(CONFIG, replace(plant, differentiable=False, episode_steps=60), [LATE], 0)  # may end by itself
     assert (elsewhere.config.pretraining.lags, elsewhere.config.pretraining.episode_steps) == (30, None)

@@ -9,9 +9,11 @@ import pytest
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import clairvoyant, mpc
 from jaxouter.evaluation.rivals.mpc import Settings, innovations_form
+from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.evaluation.rollout import excess, rollout
-from jaxouter.loop.identify import ARX, record
-from tests import lag
+from jaxouter.loop.identify import ARX, choose_arx, record
+from jaxouter.loop.policy import none
+from tests import kinds, lag
 
 KEY = jax.random.key(0)
 # K = 0.5, T = 0.3 s, d = 2.5 steps: two steps pass, then r~ jumps in the middle of a step.
@@ -65,7 +67,7 @@ def test_innovations_form_simulates_like_the_arx_model():
 
 @pytest.mark.parametrize(("d", "n", "dead"), [(0.0, 1, 0), (0.2, 1, 2), (0.25, 2, 2)])
 def test_dead_time_and_order_are_found(d, n, dead):
-    found = mpc.identify_model(record(*lag.make(d=d, max_delay=0.3), KEY, 8), 15)
+    found = choose_arx(record(*lag.make(d=d, max_delay=0.3), KEY, 8), 15)
     assert (len(found.a), found.dead) == (n, dead)
     assert innovations_form(found).gain == pytest.approx(0.5, rel=1e-5)
 
@@ -75,6 +77,38 @@ def test_it_starts_in_steady_state():
     x = true_controller().init((), 0.0, 0.4).x[:-1]
     assert C @ x == pytest.approx(0.4)
     np.testing.assert_allclose(A @ x + B * 0.4 / 0.5, x)
+
+
+INTEGRATOR = ARX(np.array([1.0]), np.array([0.04]), 0.0, 0, 1e-6)
+
+
+@pytest.mark.parametrize("pole", [1.0, 1.0 - 1e-9, 1.0 + 1e-9, 0.9999])
+def test_moves_on_an_integrator_cost_what_they_do_within_the_horizon(pole):
+    model = innovations_form(INTEGRATOR._replace(a=np.array([pole])))
+    assert mpc.effect(model, 100, 20) == pytest.approx(0.8, rel=0.01)
+    assert mpc.effect(innovations_form(TRUE), 50, 10) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_it_starts_on_an_integrator_where_y_is():
+    policy = mpc.controller(kinds.Integrating()[0], innovations_form(INTEGRATOR), 1e-6, SETTINGS)
+    x = policy.init((), 0.0, 0.4).x[:-1]
+    assert innovations_form(INTEGRATOR).C @ x == pytest.approx(0.4)
+    at_rest = policy.init((), 0.4, 0.4)._replace(r_tilde=0.0)
+    assert policy.act((), at_rest, 0.4, 0.4)[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_on_an_integrator_it_is_far_better_than_the_inner_loop_alone():
+    plant, params = kinds.Integrating()
+    arx = choose_arx(record(plant, params, KEY, 8), 30)
+    policy = mpc.controller(plant, innovations_form(arx), arx.sigma, SETTINGS._replace(horizon=20))
+    episodes = training_episodes(plant, params, KEY, 2)
+    assert score(policy, (), episodes) > 0.6 * score(*none(plant), episodes)  # both negative
+
+
+def test_horizons_reach_beyond_a_long_dead_time_and_stay_where_it_is_short():
+    plant = replace(lag.LAG, episode_steps=200)
+    assert mpc.horizons_for(plant, 5) == [20, 30, 40, 60]
+    assert mpc.horizons_for(plant, 40) == [50, 60, 70, 90]
 
 
 def test_tuned_is_near_the_controller_of_the_true_model_and_keeps_the_budget(steps, tuned):
@@ -87,7 +121,7 @@ def test_tuned_is_near_the_controller_of_the_true_model_and_keeps_the_budget(ste
 
 
 def test_model_from_noisy_data_serves_nearly_as_well_as_the_true_one(steps, data):
-    arx = mpc.identify_model(data, 15)
+    arx = choose_arx(data, 15)
     found = rollout(mpc.controller(lag.LAG, innovations_form(arx), arx.sigma, SETTINGS), (), steps)
     true = rollout(true_controller(), (), steps)
     assert mae(found) == pytest.approx(mae(true), rel=0.05)

@@ -14,8 +14,8 @@ from jaxouter.evaluation.rivals.pi import PI, PIParams
 from jaxouter.evaluation.rivals.tuning import score, training_episodes
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop import identify
-from jaxouter.loop.policy import AffineParams
-from tests import lag
+from jaxouter.loop.policy import AffineParams, none
+from tests import kinds, lag
 from tests.precision import of_single_draws
 
 KEY = jax.random.key(0)
@@ -89,6 +89,15 @@ def test_it_finds_the_reciprocal_of_the_gain_for_its_prefilter(tuned):
     assert tuned.settings["offset"] == pytest.approx(0.0, abs=1e-5)
     assert tuned.settings["kp"] > 0
     assert tuned.settings["ki"] > 0
+
+
+@pytest.mark.parametrize("plant", [kinds.Integrating, kinds.Slow])
+def test_where_y_does_not_settle_it_acts_from_where_y_stays(plant):
+    made = plant()
+    found = pi.tune(*made, KEY, 40_000, lambda text: None)
+    assert found.settings["slope"] == 0.0
+    episodes = training_episodes(*made, jax.random.split(KEY)[1])
+    assert score(*pi.build(made[0], found), episodes) > 0.7 * score(*none(made[0]), episodes)  # both negative
 
 
 def test_it_leaves_no_steady_state_error_where_the_static_prefilter_does(steps):
