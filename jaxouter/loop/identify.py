@@ -33,7 +33,8 @@ DRIFT = 0.08  # of the gain, by which it may still change in a fifth of an episo
 NEGLIGIBLE = 0.01  # of the largest coefficient of r~; the first ones below are dead time
 INTEGRATES = 0.05  # distance of a pole from 1, over one divided by the control steps in which nothing shows of it
 STEADY = (0.97, 1.05)  # ratio of the changes in two such fifths, where y grows as that of an integrator does
-ORDER_SEEN = 20  # past samples beyond the dead time that an observation has at most
+ENOUGH = 20  # past samples in an observation, of a high order
+BEYOND = 8  # of them beyond a long dead time
 BAND = 0.05  # of the step, for the settling time
 RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
 
@@ -342,7 +343,7 @@ def explore(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[list[Dynamics
 
 def history_for(order: int, dead: int, least: int) -> int:
     """Past samples that an observation must hold to tell what r~ is under way, and the state of such a plant."""
-    return max(least, dead + min(order + 1, ORDER_SEEN))
+    return max(least, dead + min(order + 1, max(ENOUGH - dead, BEYOND)))
 
 
 def suitable_history(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[int, int]:

@@ -88,7 +88,7 @@ def test_a_model_that_overflows_is_of_no_use() -> None:
     assert identify.prediction_error(ARX(np.array([1e10]), np.array([1.0]), 0.0, 0, 0.0), data, 150) == math.inf
 
 
-@pytest.mark.parametrize(("order", "dead", "history"), [(1, 0, 15), (2, 40, 43), (16, 5, 22), (32, 10, 30)])
+@pytest.mark.parametrize(("order", "dead", "history"), [(1, 0, 15), (2, 40, 43), (16, 5, 20), (32, 40, 48)])
 def test_history_reaches_beyond_the_dead_time(order: int, dead: int, history: int) -> None:
     assert identify.history_for(order, dead, HISTORY) == history
 
