@@ -77,6 +77,11 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     if config.pretraining.lags is None and start.lags == history:
         start = replace(start, lags=None)
     settling = max(one.settling for one in found)
+    if plant.episode_steps < settling < np.inf:
+        warned += (
+            f"y takes about {settling:.0f} control steps to settle, longer than an episode of {plant.episode_steps}; "
+            f"make episodes longer, or the control step",
+        )
     told = [f"dead time {dead} control steps", f"order {order}"]
     told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
     chosen = [f"history {history}"] if given is None else []

@@ -71,6 +71,12 @@ def test_episodes_are_recorded_longer_where_a_model_needs_it() -> None:
     assert "longer than half an episode of 60" in elsewhere.warnings[1]
 
 
+def test_an_episode_in_which_y_does_not_settle_is_said_to_be_short() -> None:
+    (warning,) = fitted(CONFIG, PLANT, [LATE._replace(settling=900.0)], 0).warnings
+    assert "about 900 control steps to settle, longer than an episode of 200" in warning
+    assert fitted(CONFIG, PLANT, [LATE._replace(settling=np.inf, kind="integrating")], 0).warnings == ()
+
+
 def test_a_plant_of_ones_own_is_explored_once_and_that_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(20))
     config = choose(CONFIG).config
