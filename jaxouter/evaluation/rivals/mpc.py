@@ -18,7 +18,7 @@ import scipy.linalg
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.rivals.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.rivals.tuning import Report, coordinate_search, score, training_episodes
-from jaxouter.loop.identify import ARX, HORIZON, choose_arx, record
+from jaxouter.loop.identify import ARX, HORIZON, choose_arx, record, within
 from jaxouter.plants import Plant
 
 RECORD = 50  # episodes of the record
@@ -171,7 +171,7 @@ def horizons_for(plant: Plant, dead: int) -> list[int]:
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """Model, then the settings with the greatest return on training episodes."""
     key_record, key_episodes = jax.random.split(key)
-    data = record(plant, params, key_record, RECORD)
+    data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("identifying")
     arx = choose_arx(data, round(HORIZON * plant.episode_steps))
     horizons = horizons_for(plant, arx.dead)
