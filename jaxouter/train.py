@@ -196,7 +196,9 @@ def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
     median = by_mae[(len(by_mae) - 1) // 2]
     main_figure = draw(run, met, simple_results, learned[median])
     key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
-    verdict = judge(trainer.env.plant, params.plant, key, policies, simple)
+    of_seeds = {seed: named.params for seed, named in policies.items()}
+    affine = {name: named.params for name, named in simple.items()}
+    verdict = judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine)
     summary = {
         "format": FORMAT,
         "median_seed": median,

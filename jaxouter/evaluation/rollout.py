@@ -174,6 +174,12 @@ def rollout(
     )
 
 
+def outputs(policy: Policy, policy_params: Any, scenario: Scenario) -> jax.Array:
+    """Y (episodes, T) as in `rollout`, of a JAX policy, within a function that is compiled."""
+    inputs = _Inputs(scenario.params, None, scenario.sensor, rewards.params(scenario.plant))
+    return _rollout(scenario.plant, policy, False, False, policy_params, inputs, scenario.r, scenario.keys)[1]["y"]
+
+
 @partial(jax.jit, static_argnums=0)
 def _begin_all(plant: Plant, inputs: _Inputs, keys: Any) -> _Run:
     return jax.vmap(partial(_begin, plant), (_axes(inputs), 0))(inputs, keys)

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxouter.evaluation.evaluate import Named
-from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals.tuning import EPISODES, training_episodes
-from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.rollout import outputs
+from jaxouter.loop.identify import RUN_ONCE
+from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 ON_HOST = 4  # episodes of a plant that is simulated elsewhere, and may be slow
 
 
 def judge(
-    plant: Plant, params: Any, key: chex.PRNGKey, learned: Mapping[int, Named], simple: Mapping[str, Named]
+    plant: Plant,
+    params: Any,
+    key: chex.PRNGKey,
+    policy: LearnedPolicy,
+    learned: Mapping[int, LearnedParams],
+    simple: Mapping[str, AffineParams],
 ) -> dict[str, Any]:
-    """MAE of the learned policies, by seed, and of the simple ones, by name, on fresh training episodes.
+    """MAE of the learned policies, by seed, and of affine ones, by name, on fresh training episodes.
 
     Args:
         plant, params: of the training distribution.
         key: of the episodes, of which training has seen none.
+        policy: of all seeds.
         learned, simple: what is compared.
 
     Returns:
@@ -32,9 +42,17 @@ def judge(
         text, for people.
     """
     count = EPISODES if plant.differentiable else ON_HOST
-    episodes = training_episodes(plant, params, key, count)
-    found = {name: _mae(named, episodes) for name, named in simple.items()}
-    of_seeds = {seed: _mae(named, episodes) for seed, named in learned.items()}
+    idle = jax.tree.map(
+        jnp.zeros_like, next(iter(learned.values())).actor
+    )  # its action is zero: what is left is affine
+
+    def of(policy_params: LearnedParams) -> float:
+        strong = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), policy_params)  # else compiled for anew
+        value = float(_mean_error(plant, policy, count, params, strong, key))
+        return value if np.isfinite(value) else np.inf
+
+    found = {name: of(LearnedParams(idle, affine)) for name, affine in simple.items()}
+    of_seeds = {seed: of(each) for seed, each in learned.items()}
     best = min(found, key=lambda name: found[name])
     worse = [seed for seed, value in of_seeds.items() if not value <= found[best] or np.isinf(value)]
     return {
@@ -46,9 +64,12 @@ def judge(
     }
 
 
-def _mae(named: Named, episodes: Any) -> float:
-    value = mae(rollout(named.policy, named.params, episodes))
-    return value if np.isfinite(value) else np.inf
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=RUN_ONCE)
+def _mean_error(
+    plant: Plant, policy: LearnedPolicy, count: int, params: Any, policy_params: LearnedParams, key: chex.PRNGKey
+) -> jax.Array:
+    episodes = training_episodes(plant, params, key, count)
+    return jnp.mean(jnp.abs(episodes.r - outputs(policy, policy_params, episodes)))
 
 
 def _json(value: float) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,27 +11,35 @@ import jax.numpy as jnp
 import pytest
 
 from jaxouter import export, plants
-from jaxouter.evaluation.evaluate import Named
 from jaxouter.evaluation.verdict import judge
-from jaxouter.loop.policy import Affine, AffineParams
+from jaxouter.loop.policy import AffineParams
+from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import Run
+from jaxouter.training.trainer import build
 from tests import kinds
 from tests.training.small import small
 
 PLANT, PARAMS = kinds.late(3)()
 
 
-def affine(name: str, slope: float) -> Named:
-    return Named(name, Affine(PLANT.r_tilde_bounds), AffineParams(jnp.asarray(slope), jnp.zeros(())))
+def affine(slope: float) -> AffineParams:
+    return AffineParams(jnp.asarray(slope), jnp.zeros(()))
 
 
-SIMPLE = {"none": affine("none", 1.0), "static": affine("static", 2.0)}
+SIMPLE = {"none": affine(1.0), "static": affine(2.0)}
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(3))
 
 
 def judged(**slopes: float) -> dict[str, Any]:
-    """The verdict on affine policies by seed; with a DC gain of 0.5 a slope of 2 is right."""
-    policies = {int(seed[1:]): affine("learned", slope) for seed, slope in slopes.items()}
-    return judge(PLANT, PARAMS, jax.random.key(5), policies, SIMPLE)
+    """The verdict on policies by seed whose network does nothing; with a DC gain of 0.5 a slope of 2 is right."""
+    policy = build(small("kind"))[0].policy
+    idle = jax.tree.map(jnp.zeros_like, jax.eval_shape(policy.learner.init, jax.random.key(0)).actor)
+    learned = {int(seed[1:]): LearnedParams(idle, affine(slope)) for seed, slope in slopes.items()}
+    return judge(PLANT, PARAMS, jax.random.key(5), policy, learned, SIMPLE)
 
 
 def test_the_best_is_said_to_be() -> None:
@@ -55,8 +64,7 @@ def test_what_diverges_is_worse() -> None:
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch) -> Run:
-    monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(3))
+def run(tmp_path: Path) -> Run:
     return Run.create(small("kind"), tmp_path / "run")
 
 
