@@ -36,13 +36,15 @@ class Options:
     """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, log:FILE, pitch or heaters."""
     figure: Path | None = None
     """File for the picture; default: step-response.png, or log.png for a log."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = tyro.cli(Options, prog="python -m jaxouter.check", args=arguments)
         plant, params = plants.make(add(options.plant, options.plant_options))
         cli.use_compilation_cache()

@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,22 +24,30 @@ from jaxouter import plants
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
-from jaxouter.plants.sources import FORMS, Source, add
+from jaxouter.plants.sources import FORMS, Source, add, own_errors
 from jaxouter.training.config import OWN, PRESETS, TrainConfig
 from jaxouter.training.run import RunWarning
 
 console = Console(width=None if sys.stdout.isatty() else 140)  # a file is not cut to 80 columns
 LINE_SECONDS = 5.0  # between two plain lines of progress
+DEBUG = "--debug"
 
 
 @contextmanager
-def user_errors() -> Iterator[None]:
-    """A ValueError in here is the user's mistake: one message, exit status 2."""
+def user_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
+    """A ValueError in here is the user's mistake, or a plant's: one message, exit status 2.
+
+    Args:
+        arguments: of the command; None: those of the program. With `--debug` among them the trace is shown too.
+    """
     warnings.simplefilter("always", RunWarning)
     warnings.showwarning = show
     try:
-        yield
+        with own_errors():
+            yield
     except ValueError as error:
+        if DEBUG in (sys.argv[1:] if arguments is None else arguments):
+            traceback.print_exception(error)
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 

@@ -49,6 +49,8 @@ class Options:
     """Seed of the reference families."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the results, which must not exist; default: runs/compare-PLANT."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print plants, presets, scenarios, sweeps and policies, and end."""
 
@@ -69,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     begun = time.perf_counter()
     arguments = sys.argv[1:] if arguments is None else arguments
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
         if options.list:
             return cli.print_lists()

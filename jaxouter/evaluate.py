@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import scenarios
+from jaxouter.evaluation import pace, scenarios
 from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.rivals import RIVALS
 from jaxouter.training.run import add_plant, open_run, write_json
@@ -52,13 +52,15 @@ class Options:
     """Write all figures of merit to this file."""
     traces: Path | None = None
     """Write r, y and r~ of each scenario, (episodes, T) each, to this npz file."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
@@ -71,15 +73,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         foreign = [name for name in names if name.split("/")[0] not in policies]
         if foreign:
             raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
+        results = meet(options, policies, names)
+        named = next(iter(policies.values()))
+        show(named.name, results, origin.get("places", {}))
+        write(options, named, origin, results)
 
+
+def meet(options: Options, policies: Mapping[str, Named], names: Sequence[str]) -> Results:
+    """Each policy on the scenarios of its plant."""
+    rollouts = 1 if options.policy == "none" else 2
+    if pace.seconds(names, options.episodes, rollouts) > pace.SAID:
+        print(f"{pace.told(names, options.episodes, rollouts)}; --episodes takes fewer", flush=True)
     results: Results = {}
     with cli.console.status("") as status:
         for i, name in enumerate(names):
             status.update(f"{name} ({i + 1} of {len(names)})")
             scenario = scenarios.get(name, options.episodes, options.family_seed)
             results |= evaluate(policies[scenario.plant.name], [scenario])
-    named = next(iter(policies.values()))
-    show(named.name, results, origin.get("places", {}))
+    return results
+
+
+def write(options: Options, named: Named, origin: Mapping[str, Any], results: Results) -> None:
+    """The files that are asked for."""
     if options.json is not None:
         episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
         write_json(options.json, result(named, results, **origin, family_seed=options.family_seed, episodes=episodes))

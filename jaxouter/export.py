@@ -37,11 +37,13 @@ class Options:
     """onnx, npz, stablehlo, c or fmu."""
     out: Path | None = None
     """File to write, which must not exist; default: controller.FORMAT in the folder."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
         run_path, kind, out = check(options)
         run, seed, _ = open_run(run_path)

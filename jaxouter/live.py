@@ -53,11 +53,13 @@ class Options:
     """Most updates a period."""
     plant: str | None = None
     """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors(), ExitStack() as stack:
+    with cli.user_errors(arguments), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.live", args=arguments)
         plant = check(options)
         if options.plant is not None:

@@ -8,8 +8,9 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,7 @@ import numpy as np
 import tyro
 
 from jaxouter import cli
-from jaxouter.evaluation import figures, scenarios
+from jaxouter.evaluation import figures, pace, scenarios
 from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
@@ -30,6 +31,8 @@ from jaxouter.training.plan import plan
 from jaxouter.training.run import FORMAT, Run, write_json
 from jaxouter.training.train import NotFiniteError, Row, train
 from jaxouter.training.trainer import Trainer, TrainState
+
+WATCHING = 0.1  # of the time of learning so far, which the first look at the MAE may take of a plant outside JAX
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Options:
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
     """Go on with the run in this folder; takes no other option but a plant of your own, which is named
-    again, --tensorboard, --dry-run, --devices (draws go on
+    again, --episodes, --tensorboard, --dry-run, --debug, --devices (draws go on
     otherwise where a learner then spans another number of them) and how to find the other processes."""
     coordinator: str | None = None
     """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
@@ -54,10 +57,15 @@ class Options:
     """Processes in all, each started with the same options but its own --process-id."""
     process_id: int | None = None
     """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
+    episodes: int | None = None
+    """Episodes of each scenario after the training; default: its own number, on a plant outside JAX (gym:, fmu:) as
+    many as take no longer than the learning did."""
     tensorboard: bool = False
     """Write the metrics as TensorBoard events too, beside metrics.jsonl; needs the extra `tensorboard`."""
     dry_run: bool = False
     """Print configuration, shapes, memory and arithmetic, and end before any work."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
@@ -74,7 +82,7 @@ def parse(arguments: list[str]) -> Options:
     if options.resume is not None:
         execution = {
             name: getattr(options, name)
-            for name in ("resume", "dry_run", "tensorboard", *Processes.__dataclass_fields__)
+            for name in ("resume", "dry_run", "tensorboard", "debug", "episodes", *Processes.__dataclass_fields__)
         }
         config = dataclasses.replace(
             preset(plant), devices=options.config.devices, plant_options=options.config.plant_options
@@ -82,7 +90,7 @@ def parse(arguments: list[str]) -> Options:
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
                 "--resume takes no other option but a plant of your own, --devices, --coordinator, --num-processes, "
-                "--process-id, --tensorboard and --dry-run: the run folder holds them all"
+                "--process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds them all"
             )
         run = Run.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
@@ -97,12 +105,14 @@ def parse(arguments: list[str]) -> Options:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     begun = time.perf_counter()
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = parse(sys.argv[1:] if arguments is None else arguments)
         if options.list:
             return cli.print_lists()
         cli.use_compilation_cache()
         config = options.config.check()
+        if options.episodes is not None and options.episodes < 1:
+            raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
         if options.dry_run:
             print(json.dumps(to_dict(config), indent=2))
             return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], plan(config).lines)
@@ -117,11 +127,14 @@ def main(arguments: list[str] | None = None) -> None:
         with ExitStack() as stack:
             devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
             try:
-                finals = learn(run, options)
+                new = options.resume is None and devices.is_first()
+                with run.gone_if_nothing_is_learned() if new else nullcontext():
+                    finals = learn(run, options)
                 if devices.is_first() and finals is not None:
-                    report(run, finals, begun)
+                    report(run, finals, begun, options.episodes)
             except (OSError, NotFiniteError) as error:
-                raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
+                saved = f"what was saved before is whole, {go_on(run)}" if run.path.exists() else "nothing was saved"
+                raise SystemExit(f"error: {error}; {saved}") from None
     if finals is None:
         if devices.is_first():
             print(f"saved; {go_on(run)}", file=sys.stderr)
@@ -142,11 +155,15 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
             print(f"each plant has its own {name}, from {low:g} to {high:g}")
         for change in run.changes() if options.resume is not None else ():
             print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
-    watched = scenarios.get(scenarios.paper_scenarios(config.plant)[0])
+    begun, first = time.perf_counter(), scenarios.paper_scenarios(config.plant)[0]
+
+    @cache
+    def watched() -> scenarios.Scenario:
+        return scenarios.get(first, pace.affordable([first], 1, WATCHING * (time.perf_counter() - begun)))
 
     def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
         # With the single outputs only because the report asks for them too, in the same compiled function.
-        traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
+        traces = rollout(trainer.policy, trainer.policy_params(state), watched(), record_members=True)
         return {"mae": mae(traces)}
 
     bars = cli.TrainingProgress(config, trainer.env.plant.y_unit)
@@ -162,27 +179,36 @@ def learn(run: Run, options: Options) -> dict[int, TrainState] | None:
     return finals
 
 
-def report(run: Run, finals: dict[int, TrainState], begun: float) -> None:
+def report(run: Run, finals: dict[int, TrainState], begun: float, episodes: int | None) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, _) = run.config.plant, run.trainer
-    met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
+    seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / run.config.side_by_side
+    identifiers = scenarios.paper_scenarios(plant)
+    if episodes is None:
+        episodes = pace.affordable(identifiers, rollouts := len(finals) + len(SIMPLE), seconds)
+        if episodes is not None and episodes < scenarios.FAMILY_MEMBERS:
+            text = pace.told(identifiers, episodes, rollouts)
+            print(f"evaluation: {text}, no longer than learning did; --episodes sets another number", flush=True)
+    met = [scenarios.get(identifier, episodes) for identifier in identifiers]
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
-    simple_results = {name: evaluate(named, met, record_members=True) for name, named in simple.items()}
-    learned = {seed: evaluate(named, met, record_members=True) for seed, named in policies.items()}
+    alone = evaluate(simple["none"], met, record_members=True)
+    others = {name: named for name, named in simple.items() if name != "none"}
+    simple_results = {"none": alone} | {name: evaluate(named, met, True, alone) for name, named in others.items()}
+    learned = {seed: evaluate(named, met, record_members=True, alone=alone) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     main_figure = draw(run, met, simple_results, learned[median])
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
-        / run.config.side_by_side,
+        "training_seconds": seconds,
         "steps": run.config.steps,
         "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
         "places": places,
+        "episodes": {scenario.id: len(scenario.r) for scenario in met},
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
     }

@@ -29,7 +29,8 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import make
-from jaxouter.plants.sources import attribute
+from jaxouter.plants.errors import PlantError
+from jaxouter.plants.sources import attribute, own_errors
 from jaxouter.training.run import Run
 
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
@@ -135,8 +136,13 @@ def run(job: Job, report: Report = lambda text: None) -> Done:
     """Do one job.
 
     Raises:
-        ValueError: it can't be done, or a user's policy failed at it.
+        ValueError: it can't be done, or a user's policy or plant failed at it.
     """
+    with own_errors():
+        return _run(job, report)
+
+
+def _run(job: Job, report: Report) -> Done:
     begin, c = time.perf_counter(), job.contender
     work = {"meet": meet, "sweep": sweep, "certify": certify}.get(job.what)
     report("begun")
@@ -146,7 +152,10 @@ def run(job: Job, report: Report = lambda text: None) -> Done:
         found = work(c, job.plant, job.on, job.family_seed)
     elif c.kind == "user":
         try:
-            found = work(c, job.plant, job.on, job.family_seed)
+            with own_errors():
+                found = work(c, job.plant, job.on, job.family_seed)
+        except PlantError:
+            raise
         except Exception as error:
             raise ValueError(f"{c.name} failed on {job.on}: {type(error).__name__}: {error}") from error
     else:

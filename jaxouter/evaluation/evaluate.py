@@ -35,12 +35,22 @@ def rival(name: str, plant_name: str) -> Named:
     return Named(name, *RIVALS[name].build(make(plant_name)[0], tuned))
 
 
-def evaluate(named: Named, scenarios: Iterable[Scenario], record_members: bool = False) -> Results:
-    """Traces (with the single outputs where asked for) and figures of merit on each scenario."""
+def evaluate(
+    named: Named, scenarios: Iterable[Scenario], record_members: bool = False, alone: Results | None = None
+) -> Results:
+    """Traces and figures of merit on each scenario.
+
+    Args:
+        named: the policy.
+        scenarios: on which.
+        record_members: with the single outputs.
+        alone: what this gave of `none` on the same scenarios; None: it is run here.
+    """
     results = {}
     for scenario in scenarios:
         traces = rollout(named.policy, named.params, scenario, record_members)
-        inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario, record_members)
+        inner = traces if named.name == "none" else None if alone is None else alone[scenario.id][0]
+        inner = rollout(*none(scenario.plant), scenario, record_members) if inner is None else inner
         results[scenario.id] = traces, figures_of_merit(traces, scenario, mae(inner))
     return results
 

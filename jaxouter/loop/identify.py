@@ -12,9 +12,13 @@ import numpy as np
 
 from jaxouter.loop.policy import Affine, AffineParams
 from jaxouter.loop.references import telegraph
-from jaxouter.plants import Plant, simulate
+from jaxouter.plants import Plant, host, simulate
 
 LEVELS = 8
+SIGNIFICANT = 3.0  # standard errors, by which y must have moved with r~
+TINY = 1e-3  # of the span of the set-points, by which all of r~ must move y
+LONGER = 5  # episodes, in which y is seen to move at last
+ROUNDING = 1e-6  # of y
 RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
 
 
@@ -31,30 +35,109 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
     Each starts like a training episode; a line is fitted through the last tenth of each.
 
     Raises:
-        ValueError: y did not depend on r~, or was not finite.
+        ValueError: y does not tell how it answers to r~; says why.
     """
-    levels, y = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
+    if (simulators := host.of(plant)) is not None:
+        simulators.ended = None
+    levels, ends, y = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
+    why = unanswered(plant, params, key, levels, ends, y)
+    if why is not None:
+        raise ValueError(f"the DC gain of {plant.name} can't be found: {why}")
     centred = levels - np.mean(levels)
-    gain = np.sum(centred * y) / np.sum(centred**2)
-    if not np.isfinite(gain) or abs(gain) < 1e-6:
-        bounds = plant.r_tilde_bounds
-        raise ValueError(f"the DC gain of {plant.name} came out as {gain}: no r~ in {bounds} moves its output")
-    return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(y) - gain * np.mean(levels)))
+    gain = np.sum(centred * ends) / np.sum(centred**2)
+    return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(ends) - gain * np.mean(levels)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
-    """Levels of r~ (8,), and where y comes to under each (8,)."""
+def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Levels of r~ (8,), where y comes to under each (8,), and y on its way (8, T)."""
     low, high = plant.r_tilde_bounds
     levels = low + (high - low) * (jnp.arange(LEVELS, dtype=float) + 0.5) / LEVELS
 
-    def episode(level: jax.Array, key: chex.PRNGKey) -> jax.Array:
+    def episode(level: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
         key_start, key_run = jax.random.split(key)
         state = plant.training_start(key_start, params)
         y = simulate(plant, params, jnp.full(plant.episode_steps, level), key_run, state)
-        return jnp.mean(y[-max(1, plant.episode_steps // 10) :])
+        return jnp.mean(y[-max(1, plant.episode_steps // 10) :]), y
 
-    return levels, jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
+    return levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
+
+
+def unanswered(
+    plant: Plant, params: Any, key: chex.PRNGKey, levels: np.ndarray, ends: np.ndarray, y: np.ndarray
+) -> str | None:
+    """Why y does not tell how it answers to r~; None: it does.
+
+    Args:
+        plant, params: stepped again only where it seems not to.
+        key: of the starts.
+        levels: (8,), constant r~.
+        ends: (8,), where y comes to under each.
+        y: (8, T), on its way.
+    """
+    broken = ~np.isfinite(y)
+    if broken.any():
+        k = int(broken.any(0).argmax())
+        level, value = levels[broken[:, k].argmax()], y[broken[:, k].argmax(), k]
+        ended = getattr(host.of(plant), "ended", None)
+        why = "" if ended is None else f": {ended}; choose --episode-steps so that an episode is over by then"
+        return f"y is {value} from control step {k + 1} of {y.shape[1]} on under r~ = {level:g}{why}"
+    (low, high), setpoints = plant.r_tilde_bounds, np.ptp(plant.setpoint_range)
+    # Where y began counts too: what is left of it at the end is no answer to r~.
+    causes = np.stack([np.ones(LEVELS), levels / (high - low), y[:, 0] / setpoints], 1)
+    effect, *_ = np.linalg.lstsq(causes, ends / setpoints, rcond=None)
+    spread = np.std(ends / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
+    if abs(effect[1]) > max(SIGNIFICANT * spread, TINY):
+        return None
+    moved = _moved(plant, params, key, levels, y.shape[1])
+    if not moved.any():
+        longer = _moved(plant, params, key, levels, LONGER * y.shape[1])
+        same = f"y is the same under {LEVELS} levels of r~ from {levels[0]:g} to {levels[-1]:g}"
+        if longer.any():
+            dead = int((longer > 0).argmax())
+            return (
+                f"{same} for {dead} control steps, its dead time, and an episode has {y.shape[1]}: make it several "
+                "times as long as the dead time (episode_steps)"
+            )
+        return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
+    most = float(moved.max())
+    if most < TINY * setpoints:
+        return (
+            f"all of r~, {low:g} to {high:g} {plant.y_unit}, moves y by {most:.3g} {plant.y_unit}, and its set-points "
+            f"span {setpoints:.3g} {plant.y_unit}: a gain so small holds none of them"
+        )
+    if abs(effect[1]) > TINY:
+        return None  # in spite of the noise
+    return f"y does not move one way as r~ rises: it comes to {_numbers(ends)} at r~ of {_numbers(levels)}"
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def _moved(plant: Plant, params: Any, key: chex.PRNGKey, levels: np.ndarray, steps: int) -> np.ndarray:
+    """By how much the levels of r~ move y apart, (T,), less rounding; as far as the plant goes on, at most `steps`.
+
+    All have the same start and noise.
+    """
+    try:
+        y = np.asarray(_together(plant, steps, params, key, levels))
+    except (ValueError, jax.errors.JaxRuntimeError):  # a simulator that does not go on
+        return np.zeros(plant.episode_steps)
+    y = y[:, : int(np.append(~np.isfinite(y).all(0), True).argmax())]
+    return np.where(np.ptp(y, 0) > ROUNDING * np.abs(y).max(initial=0.0), np.ptp(y, 0), 0.0)
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=RUN_ONCE)
+def _together(plant: Plant, steps: int, params: Any, key: chex.PRNGKey, levels: jax.Array) -> jax.Array:
+    """Y (8, T) under constant levels of r~ (8,), with the same start and noise."""
+    key_start, key_run = jax.random.split(key)
+
+    def episode(level: jax.Array) -> jax.Array:
+        state = plant.training_start(key_start, params)
+        return simulate(plant, params, jnp.full(steps, level), key_run, state)
+
+    return jax.vmap(episode)(jnp.asarray(levels))
 
 
 def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, AffineParams]:
@@ -76,8 +159,9 @@ def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Recor
     Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
     log-uniform from four times an episode to every other step.
     """
-    r_tilde, y = _episodes(plant, params, jax.random.split(key, episodes))
-    return Record(np.asarray(r_tilde, np.float64), np.asarray(y, np.float64))
+    keys, n = jax.random.split(key, episodes), host.side_by_side(plant) or episodes
+    parts = [_episodes(plant, params, keys[i : i + n]) for i in range(0, episodes, n)]
+    return Record(*(np.concatenate(column).astype(np.float64) for column in zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)

@@ -32,6 +32,7 @@ from jaxouter.training.trainer import Trainer, TrainState, build
 
 FORMAT = 1
 KEEP = 2  # checkpoints of each seed
+SAVED = ("checkpoint-*.npz", "pretraining.npz")  # what a seed can go on from
 
 
 class RunWarning(UserWarning):
@@ -121,6 +122,17 @@ class Run:
                 file.write(str(os.getpid()))
                 file.flush()
             yield
+
+    @contextmanager
+    def gone_if_nothing_is_learned(self) -> Iterator[None]:
+        """The folder, new, is removed where the block fails before anything was saved in it."""
+        try:
+            yield
+        except BaseException:
+            folders = list(map(self.seed_folder, self.seeds))
+            if not any(path for folder in folders for name in SAVED for path in folder.glob(name)):
+                shutil.rmtree(self.path, ignore_errors=True)
+            raise
 
     def changes(self) -> list[str]:
         """What the results depend on and is no longer what it was when the run was made."""
