@@ -184,13 +184,13 @@ def _guarded(plant: Plant) -> Plant:
 
 
 class _Kept(logging.Filter):
-    """Keeps the first exception that JAX logs, and lets none be written."""
+    """Keeps the last exception that JAX logs, and lets none be written."""
 
-    first: BaseException | None = None
+    last: BaseException | None = None
 
     def filter(self, record: logging.LogRecord) -> bool:
         error = record.exc_info[1] if record.exc_info else None
-        self.first = self.first or error
+        self.last = error or self.last
         return error is None
 
 
@@ -210,13 +210,13 @@ def own_errors() -> Iterator[None]:
         logger.filters.insert(0, kept)  # before that of a block around this one
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        first = kept.first
-        if isinstance(first, PlantError):
-            raise first from first.__cause__
-        if first is None and "callback" not in str(error):  # it is about something else
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises one or the other
+        last = kept.last
+        if isinstance(error, PlantError) or "callback" not in str(error):
             raise
-        what = str(error).strip().splitlines()[-1] if first is None else said(first)
+        if isinstance(last, PlantError):
+            raise last from last.__cause__
+        what = str(error).strip().splitlines()[-1] if last is None else said(last)
         raise PlantError(", ".join(SOURCES), "in a function that JAX calls back", what) from error
     finally:
         for logger in loggers:
