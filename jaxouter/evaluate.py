@@ -83,7 +83,7 @@ def meet(options: Options, policies: Mapping[str, Named], names: Sequence[str]) 
     """Each policy on the scenarios of its plant."""
     rollouts = 1 if options.policy == "none" else 2
     if pace.seconds(names, options.episodes, rollouts) > pace.SAID:
-        print(f"{pace.told(names, options.episodes, rollouts)}; --episodes takes fewer", flush=True)
+        print(f"{pace.told(names, options.episodes, rollouts)}; --episodes N is N of each", flush=True)
     results: Results = {}
     with cli.console.status("") as status:
         for i, name in enumerate(names):

@@ -188,7 +188,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, episodes: int 
         episodes = pace.affordable(identifiers, rollouts := len(finals) + len(SIMPLE), seconds)
         if episodes is not None and episodes < scenarios.FAMILY_MEMBERS:
             text = pace.told(identifiers, episodes, rollouts)
-            print(f"evaluation: {text}, no longer than learning did; --episodes sets another number", flush=True)
+            print(f"evaluation: {text}, as long as learning took at most; --episodes sets another number", flush=True)
     met = [scenarios.get(identifier, episodes) for identifier in identifiers]
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}

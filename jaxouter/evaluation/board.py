@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -239,6 +240,10 @@ def spread(work: Sequence[Job], initialise: Callable[[], None], report: Report) 
                         freed = (job for job in work if job.contender == finished.job.contender and job != finished.job)
                         waiting |= {pool.submit(_Worker.run, job) for job in freed}
                     yield finished
+        except BrokenProcessPool:
+            raise ValueError(
+                "a process of the comparison ended at once: memory ran out, or a library crashed"
+            ) from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():

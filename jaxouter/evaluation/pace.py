@@ -45,9 +45,10 @@ def told(identifiers: Iterable[str], episodes: int | None, rollouts: int) -> str
     """How long an evaluation is going to take, in a line."""
     names = list(identifiers)
     each = 1e3 * (host.step_seconds(_plant(names[0])) or 0.0)
+    many = "1 scenario" if len(names) == 1 else f"{len(names)} scenarios"
     return (
-        f"{len(names)} scenarios of {episodes or FAMILY_MEMBERS} episodes take about "
-        f"{duration(seconds(names, episodes, rollouts))}, as the plant takes {each:.2g} ms a control step"
+        f"{many} of {episodes or FAMILY_MEMBERS} episodes: about "
+        f"{duration(seconds(names, episodes, rollouts))}, at {each:.2g} ms a control step"
     )
 
 
