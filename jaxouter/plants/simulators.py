@@ -236,13 +236,13 @@ def _extracted(path: str, validate: bool) -> tuple[Any, str]:
     except ImportError:
         raise ValueError('a plant fmu:FILE needs FMPy: pip install "jaxouter[fmu]"') from None
     try:
-        description = fmpy.read_model_description(path, validate=validate)
         folder = str(fmpy.extract(path))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        description = fmpy.read_model_description(folder, validate=validate)
     except ValidationError as error:
         raise ValueError(f"{path}: {error}\nMend it, or take it as it is by --no-validate") from None
     except Exception as error:  # whatever a file that is none makes FMPy raise
         raise ValueError(f"{path} is not a readable FMU: {said(error)}") from None
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     if description.coSimulation is None or not str(description.fmiVersion).startswith(("2", "3")):
         raise ValueError(f"{path} is FMI {description.fmiVersion}; it must be FMI 2 or 3, for co-simulation")
     return description, folder

@@ -1,5 +1,6 @@
 """How long plants outside JAX take, and in what groups their episodes go."""
 
+import json
 import re
 from unittest.mock import patch
 
@@ -16,7 +17,7 @@ from jaxouter.loop import identify
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
 from jaxouter.training.run import Run
-from tests.training.small import TINY
+from tests.training.small import TINY, small
 
 NAMES = ["mine/steps", "mine/staircase", "mine/ramps"]
 DECLARED = dict(y_unit="cm", time_unit="s", control_step=0.1, episode_steps=20, family_steps=20)
@@ -122,13 +123,18 @@ def test_a_run_that_learned_nothing_leaves_no_folder(capsys, tmp_path, monkeypat
 @pytest.mark.usefixtures("slow")
 def test_after_the_training_of_a_slow_plant_there_are_few_episodes(capsys, tmp_path, monkeypatch):
     """As many as are asked for, or as take no longer than learning did."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Run, "rows", lambda run, seed: [{"epoch": 0, "steps": 0, "seconds": 3 * 3 * 20 * 7e-3 * 4.5}])
-    train.main(["mine", "--out", "run", *TINY])
-    out = capsys.readouterr().out
-    assert "evaluation: 3 scenarios of 4 episodes: about 5 s, at 7 ms a control step, as long as learning took" in out
-    parsed = train.parse(["--resume", "run", "--episodes", "2"])
-    assert (parsed.episodes, parsed.config.plant) == (2, "mine")
+    run = Run.create(small("mine"), tmp_path / "run")
+    trainer, params = run.trainer
+    finals = {0: trainer.fresh(jax.random.key(0), params)}
+    monkeypatch.setattr(train, "draw", lambda *_: "figure")
+    for seconds, asked, episodes in ((4.5, None, 4), (1e6, None, 64), (4.5, 2, 2)):
+        rows = [{"seconds": 3 * 3 * 20 * 7e-3 * seconds}]  # of three policies on three scenarios
+        monkeypatch.setattr(Run, "rows", lambda run, seed, rows=rows: rows)
+        train.report(run, finals, 0.0, asked)
+        text = "evaluation: 3 scenarios of 4 episodes: about 5 s, at 7 ms a control step, as long as learning took"
+        assert (text in capsys.readouterr().out) == (episodes == 4)
+        assert set(json.loads((run.path / "summary.json").read_text())["episodes"].values()) == {episodes}
+    assert train.parse(["--resume", str(run.path), "--episodes", "2"]).episodes == 2
     with pytest.raises(SystemExit):
         train.main(["mine", "--episodes", "0"])
     assert "--episodes is 0; it must be at least 1" in capsys.readouterr().err
