@@ -14,6 +14,7 @@ import tyro
 from jaxouter import cli
 from jaxouter.deploy import c, fmu, verify
 from jaxouter.deploy.law import Law
+from jaxouter.plants import Plant
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.run import add_plant, open_run
 
@@ -49,9 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run, seed, _ = open_run(run_path)
         cli.use_compilation_cache()
         state, _ = run.load(seed)
-    trainer, _ = run.trainer
-    policy, params = trainer.policy, trainer.policy_params(state)
-    law = Law.of(policy, params, trainer.env.plant)
+        trainer, _ = run.trainer
+        export(kind, out, seed, trainer.policy, trainer.policy_params(state), trainer.env.plant)
+
+
+def export(kind: str, out: Path, seed: int, policy: LearnedPolicy, params: LearnedParams, plant: Plant) -> None:
+    """Write the controller, verified, and say what it is."""
+    law = Law.of(policy, params, plant)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent) as place:
         made = Path(place) / out.name
         write(kind, made, law, policy, params)

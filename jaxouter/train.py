@@ -23,7 +23,8 @@ from jaxouter.evaluation.evaluate import Named, Results, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.plants.sources import add
+from jaxouter.plants.errors import PlantError
+from jaxouter.plants.sources import add, own_errors
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
@@ -128,10 +129,14 @@ def main(arguments: list[str] | None = None) -> None:
             devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
             try:
                 new = options.resume is None and devices.is_first()
-                with run.gone_if_nothing_is_learned() if new else nullcontext():
-                    finals = learn(run, options)
-                if devices.is_first() and finals is not None:
-                    report(run, finals, begun, options.episodes)
+                with own_errors():
+                    with run.gone_if_nothing_is_learned() if new else nullcontext():
+                        finals = learn(run, options)
+                    if devices.is_first() and finals is not None:
+                        report(run, finals, begun, options.episodes)
+            except PlantError as error:
+                kept = f"; what was learned is in {run.path}" if run.path.exists() else ""
+                raise ValueError(f"{error}{kept}") from error
             except (OSError, NotFiniteError) as error:
                 saved = f"what was saved before is whole, {go_on(run)}" if run.path.exists() else "nothing was saved"
                 raise SystemExit(f"error: {error}; {saved}") from None

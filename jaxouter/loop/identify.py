@@ -39,42 +39,49 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
     """
     if (simulators := host.of(plant)) is not None:
         simulators.ended = None
-    levels, ends, y = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
-    why = unanswered(plant, params, key, levels, ends, y)
-    if why is not None:
-        raise ValueError(f"the DC gain of {plant.name} can't be found: {why}")
+    steady = Steady(*map(np.asarray, _steady(plant, params, key)))  # the rest on the host, where nothing is compiled
+    levels, ends = steady.levels, steady.ends
     centred = levels - np.mean(levels)
     gain = np.sum(centred * ends) / np.sum(centred**2)
+    why = unanswered(plant, params, key, steady, float(gain))
+    if why is not None:
+        raise ValueError(f"the DC gain of {plant.name} can't be found: {why}")
     return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(ends) - gain * np.mean(levels)))
 
 
+class Steady(NamedTuple):
+    """Episodes of constant r~."""
+
+    levels: Any  # (8,), r~
+    starts: Any  # (8,), y_0
+    ends: Any  # (8,), where y comes to
+    y: Any  # (8, T), on its way
+
+
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Levels of r~ (8,), where y comes to under each (8,), and y on its way (8, T)."""
+def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> Steady:
     low, high = plant.r_tilde_bounds
     levels = low + (high - low) * (jnp.arange(LEVELS, dtype=float) + 0.5) / LEVELS
 
-    def episode(level: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+    def episode(level: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
         key_start, key_run = jax.random.split(key)
         state = plant.training_start(key_start, params)
         y = simulate(plant, params, jnp.full(plant.episode_steps, level), key_run, state)
-        return jnp.mean(y[-max(1, plant.episode_steps // 10) :]), y
+        return plant.output(params, state), jnp.mean(y[-max(1, plant.episode_steps // 10) :]), y
 
-    return levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
+    return Steady(levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS)))
 
 
-def unanswered(
-    plant: Plant, params: Any, key: chex.PRNGKey, levels: np.ndarray, ends: np.ndarray, y: np.ndarray
-) -> str | None:
+def unanswered(plant: Plant, params: Any, key: chex.PRNGKey, steady: Steady, gain: float) -> str | None:
     """Why y does not tell how it answers to r~; None: it does.
 
     Args:
         plant, params: stepped again only where it seems not to.
         key: of the starts.
-        levels: (8,), constant r~.
-        ends: (8,), where y comes to under each.
-        y: (8, T), on its way.
+        steady: what came.
+        gain: of the line through it.
     """
+    levels, starts, ends, y = steady
     broken = ~np.isfinite(y)
     if broken.any():
         k = int(broken.any(0).argmax())
@@ -84,7 +91,7 @@ def unanswered(
         return f"y is {value} from control step {k + 1} of {y.shape[1]} on under r~ = {level:g}{why}"
     (low, high), setpoints = plant.r_tilde_bounds, np.ptp(plant.setpoint_range)
     # Where y began counts too: what is left of it at the end is no answer to r~.
-    causes = np.stack([np.ones(LEVELS), levels / (high - low), y[:, 0] / setpoints], 1)
+    causes = np.stack([np.ones(LEVELS), levels / (high - low), starts / setpoints], 1)
     effect, *_ = np.linalg.lstsq(causes, ends / setpoints, rcond=None)
     spread = np.std(ends / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
     if abs(effect[1]) > max(SIGNIFICANT * spread, TINY):
@@ -106,7 +113,7 @@ def unanswered(
             f"all of r~, {low:g} to {high:g} {plant.y_unit}, moves y by {most:.3g} {plant.y_unit}, and its set-points "
             f"span {setpoints:.3g} {plant.y_unit}: a gain so small holds none of them"
         )
-    if abs(effect[1]) > TINY:
+    if abs(gain) * (high - low) > TINY * setpoints:
         return None  # in spite of the noise
     return f"y does not move one way as r~ rises: it comes to {_numbers(ends)} at r~ of {_numbers(levels)}"
 

@@ -5,6 +5,7 @@ A NumPy scalar or an array without dimensions is a number, a list a tuple, 120.0
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -34,6 +35,18 @@ def number(value: Any) -> float:
         raise TypeError(value)
     short = array.dtype.itemsize < 8 and np.issubdtype(array.dtype, np.floating)
     return float(str(array[()])) if short else float(array)
+
+
+def plain(value: Any) -> Any:
+    """A value of a configuration, with Python's numbers in place of arrays without dimensions, and tuples of lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.replace(value, **{name: plain(part) for name, part in vars(value).items()})
+    if isinstance(value, tuple | list):
+        return tuple(map(plain, value))
+    if getattr(value, "ndim", None) == 0:  # NumPy's scalars have it too
+        array = np.asarray(value)
+        return number(array) if np.issubdtype(array.dtype, np.floating) else array.item()
+    return value
 
 
 def _number(holds: Callable[[float], bool]) -> Callable[[Any], float]:

@@ -111,6 +111,20 @@ def test_a_plant_that_fails_in_a_comparison_is_named(capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_a_plant_that_fails_after_learning_leaves_what_was_learned(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plants.REGISTRY["mine"] = lambda: MINE
+    monkeypatch.setattr(train, "learn", lambda run, options: {0: None})
+    monkeypatch.setattr(train, "report", lambda *_: simulate(*MINE, jnp.ones(8), jax.random.key(0)))
+    with pytest.raises(SystemExit) as end:
+        train.main(["mine", "--out", "run", "--history", "2"])
+    assert end.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: plant mine, control step 4 of")
+    assert message.endswith("division by zero; what was learned is in run\n")
+    assert (tmp_path / "run").is_dir()
+
+
 MINE = host.plant(Lag, name="mine", **DECLARED)
 
 
