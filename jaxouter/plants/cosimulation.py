@@ -11,7 +11,9 @@ import os
 import signal
 import subprocess
 import sys
+import weakref
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -157,6 +159,7 @@ class Apart:
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._process: subprocess.Popen[str] | None = None
+        self._end: Callable[[], Any] = lambda: None
         self._each = False  # a process for each episode
         self.ended: str | None = None
 
@@ -173,6 +176,7 @@ class Apart:
         program = [sys.executable, "-P", __file__, json.dumps(self._setup)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(program, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
+        self._end = weakref.finalize(self, _killed, self._process)  # also as the interpreter ends
         return self._ask("reset")
 
     def step(self, r_tilde: float) -> float:
@@ -181,14 +185,8 @@ class Apart:
 
     def free(self) -> None:
         """End the process."""
-        process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            process.communicate()
-
-    def __del__(self) -> None:
-        with suppress(Exception):  # as the interpreter ends
-            self.free()
+        self._process = None
+        self._end()
 
     def _ask(self, what: str) -> float:
         assert self._process is not None
@@ -205,6 +203,11 @@ class Apart:
         if error is not None:
             raise FmuError(error)
         return y
+
+
+def _killed(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
 
 
 def main() -> None:
