@@ -39,72 +39,73 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
     """
     if (simulators := host.of(plant)) is not None:
         simulators.ended = None
-    steady = Steady(*map(np.asarray, _steady(plant, params, key)))  # the rest on the host, where nothing is compiled
-    levels, ends = steady.levels, steady.ends
+    levels, y, course = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
     centred = levels - np.mean(levels)
-    gain = np.sum(centred * ends) / np.sum(centred**2)
-    why = unanswered(plant, params, key, steady, float(gain))
+    gain = np.sum(centred * y) / np.sum(centred**2)
+    why = unanswered(plant, params, key, levels, y, course, float(gain))
     if why is not None:
         raise ValueError(f"the DC gain of {plant.name} can't be found: {why}")
-    return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(ends) - gain * np.mean(levels)))
-
-
-class Steady(NamedTuple):
-    """Episodes of constant r~."""
-
-    levels: Any  # (8,), r~
-    starts: Any  # (8,), y_0
-    ends: Any  # (8,), where y comes to
-    y: Any  # (8, T), on its way
+    return DcGain(jnp.asarray(gain), jnp.asarray(np.mean(y) - gain * np.mean(levels)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> Steady:
+def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Levels of r~ (8,), where y comes to under each (8,), and its course (8, T + 1)."""
     low, high = plant.r_tilde_bounds
     levels = low + (high - low) * (jnp.arange(LEVELS, dtype=float) + 0.5) / LEVELS
 
-    def episode(level: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def episode(level: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
         key_start, key_run = jax.random.split(key)
         state = plant.training_start(key_start, params)
         y = simulate(plant, params, jnp.full(plant.episode_steps, level), key_run, state)
-        return plant.output(params, state), jnp.mean(y[-max(1, plant.episode_steps // 10) :]), y
+        course = jnp.concatenate([plant.output(params, state)[None], y])
+        return jnp.mean(y[-max(1, plant.episode_steps // 10) :]), course
 
-    return Steady(levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS)))
+    return levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
 
 
-def unanswered(plant: Plant, params: Any, key: chex.PRNGKey, steady: Steady, gain: float) -> str | None:
+def unanswered(
+    plant: Plant,
+    params: Any,
+    key: chex.PRNGKey,
+    levels: np.ndarray,
+    y: np.ndarray,
+    course: np.ndarray,
+    gain: float,
+) -> str | None:
     """Why y does not tell how it answers to r~; None: it does.
 
     Args:
         plant, params: stepped again only where it seems not to.
         key: of the starts.
-        steady: what came.
-        gain: of the line through it.
+        levels: of r~ (8,), one an episode.
+        y: (8,), where it comes to under each.
+        course: (8, T + 1), y_0 to y_T.
+        gain: of the line through y.
     """
-    levels, starts, ends, y = steady
-    broken = ~np.isfinite(y)
+    steps = course.shape[1] - 1
+    broken = ~np.isfinite(course)
     if broken.any():
         k = int(broken.any(0).argmax())
-        level, value = levels[broken[:, k].argmax()], y[broken[:, k].argmax(), k]
+        level, value = levels[broken[:, k].argmax()], course[broken[:, k].argmax(), k]
         ended = getattr(host.of(plant), "ended", None)
         why = "" if ended is None else f": {ended}; choose --episode-steps so that an episode is over by then"
-        return f"y is {value} from control step {k + 1} of {y.shape[1]} on under r~ = {level:g}{why}"
+        return f"y is {value} from control step {k} of {steps} on under r~ = {level:g}{why}"
     (low, high), setpoints = plant.r_tilde_bounds, np.ptp(plant.setpoint_range)
     # Where y began counts too: what is left of it at the end is no answer to r~.
-    causes = np.stack([np.ones(LEVELS), levels / (high - low), starts / setpoints], 1)
-    effect, *_ = np.linalg.lstsq(causes, ends / setpoints, rcond=None)
-    spread = np.std(ends / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
+    causes = np.stack([np.ones(LEVELS), levels / (high - low), course[:, 0] / setpoints], 1)
+    effect, *_ = np.linalg.lstsq(causes, y / setpoints, rcond=None)
+    spread = np.std(y / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
     if abs(effect[1]) > max(SIGNIFICANT * spread, TINY):
         return None
-    moved = _moved(plant, params, key, levels, y.shape[1])
+    moved = _moved(plant, params, key, levels, steps)
     if not moved.any():
-        longer = _moved(plant, params, key, levels, LONGER * y.shape[1])
+        longer = _moved(plant, params, key, levels, LONGER * steps)
         same = f"y is the same under {LEVELS} levels of r~ from {levels[0]:g} to {levels[-1]:g}"
         if longer.any():
-            dead = int((longer > 0).argmax())
             return (
-                f"{same} for {dead} control steps, its dead time, and an episode has {y.shape[1]}: make it several "
-                "times as long as the dead time (episode_steps)"
+                f"{same} for {int((longer > 0).argmax())} control steps, its dead time, and an episode has {steps}: "
+                "make it several times as long as the dead time (episode_steps)"
             )
         return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
     most = float(moved.max())
@@ -115,7 +116,7 @@ def unanswered(plant: Plant, params: Any, key: chex.PRNGKey, steady: Steady, gai
         )
     if abs(gain) * (high - low) > TINY * setpoints:
         return None  # in spite of the noise
-    return f"y does not move one way as r~ rises: it comes to {_numbers(ends)} at r~ of {_numbers(levels)}"
+    return f"y does not move one way as r~ rises: it comes to {_numbers(y)} at r~ of {_numbers(levels)}"
 
 
 def _numbers(values: np.ndarray) -> str:
