@@ -117,7 +117,7 @@ def test_a_run_that_learned_nothing_leaves_no_folder(capsys, tmp_path, monkeypat
         train.main(["mine", *TINY])
     assert end.value.code == 2
     assert re.search(r"error: plant mine, control step \d of the episode with seed \d+, r~ = ", capsys.readouterr().err)
-    assert list((tmp_path / "runs").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("slow")
