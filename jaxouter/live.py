@@ -18,6 +18,7 @@ from jaxouter import cli
 from jaxouter.deploy.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
 from jaxouter.deploy.realtime import Loop, Row, Settings, StepError, run
 from jaxouter.evaluation import figures
+from jaxouter.plants.errors import Raised
 from jaxouter.plants.sources import attribute
 from jaxouter.training.run import add_plant, write_json
 
@@ -105,7 +106,7 @@ def check(options: Options) -> Callable[[float], Any]:
     else:
         try:
             found = getattr(importlib.import_module(file), name)
-        except Exception as error:  # whatever the module raises
+        except Raised as error:  # whatever the module raises
             raise ValueError(f"{options.step} can't be imported: {error}") from None
     if not callable(found):
         raise ValueError(f"{options.step} is {found!r}; it must be a function of r~ that gives y")

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxouter import check, evaluate, train
 from jaxouter.loop.references import FAMILIES
 from jaxouter.plants import Plant, contract, declaration
 from jaxouter.plants.simulators import PlantOptions
 from tests.lag import LAG, make
+from tests.load import ROOT
 
 
 def changed(**fields):
@@ -92,6 +94,20 @@ def test_options_of_a_plant_are_refused_by_name(options, text):
         PlantOptions(**options).declared(**defaults)
     found = PlantOptions(r_tilde_bounds=[-2, 2], episode_steps=5.0).declared(**defaults)
     assert (found["r_tilde_bounds"], found["episode_steps"], found["setpoint_range"]) == ((-2.0, 2.0), 5, (-1.0, 1.0))
+
+
+@pytest.mark.parametrize("command", [(check,), (train,), (train, "--dry-run"), (evaluate, "--policy", "none")])
+def test_every_command_refuses_a_declaration_alike(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tanks = (ROOT / "scripts" / "examples" / "tanks.py").read_text()
+    (tmp_path / "own.py").write_text(tanks.replace("episode_steps=200", "episode_steps=-200"))
+    module, *arguments = command
+    with pytest.raises(SystemExit) as end:
+        module.main([*(["--plant"] if module is evaluate else []), "own.py:Tanks", *arguments])
+    assert end.value.code == 2
+    text = "plant 'Tanks': episode_steps is -200; it must be a whole number, at least 1\n"
+    assert capsys.readouterr().err.endswith(text)
+    assert {path.name for path in tmp_path.iterdir()} <= {"own.py", "__pycache__"}
 
 
 @pytest.mark.parametrize(
