@@ -270,13 +270,11 @@ class _Experiment(NamedTuple):
 
     @classmethod
     def of(cls, description: Any) -> _Experiment:
-        said = description.defaultExperiment
-        start, stop, step = (
-            None if said is None or getattr(said, name) is None else float(getattr(said, name))
-            for name in ("startTime", "stopTime", "stepSize")
-        )
-        fixed = description.coSimulation.fixedInternalStepSize
-        return cls(start or 0.0, stop, step or fixed, None if fixed is None else float(fixed))
+        said, interface = description.defaultExperiment, description.coSimulation
+        pairs = (said, "startTime"), (said, "stopTime"), (said, "stepSize"), (interface, "fixedInternalStepSize")
+        values = [getattr(where, name, None) for where, name in pairs]
+        start, stop, step, fixed = (None if value is None else float(value) for value in values)
+        return cls(start or 0.0, stop, step or fixed, fixed)
 
     def most(self, control_step: float) -> int | None:
         """Control steps until its stop time."""

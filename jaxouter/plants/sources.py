@@ -204,6 +204,7 @@ def own_errors() -> Iterator[None]:
 
     Raises:
         PlantError: it did.
+        KeyboardInterrupt: it was interrupted.
     """
     kept, loggers = _Kept(), [logging.getLogger(name) for name in CALLBACKS]
     for logger in loggers:
@@ -216,6 +217,8 @@ def own_errors() -> Iterator[None]:
             raise
         if isinstance(last, PlantError):
             raise last from last.__cause__
+        if isinstance(last, KeyboardInterrupt):  # Ctrl-C while a plant was stepped
+            raise last from None
         what = str(error).strip().splitlines()[-1] if last is None else said(last)
         raise PlantError(", ".join(SOURCES), "in a function that JAX calls back", what) from error
     finally:

@@ -97,6 +97,17 @@ def test_the_trace_is_shown_where_it_is_asked_for(failing, capsys):
     assert "error: plant mine, control step 4" in message.splitlines()[-1]
 
 
+def interrupted():
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_is_no_error_of_a_simulator(failing, monkeypatch, capsys):
+    monkeypatch.setattr(Lag, "fails", staticmethod(interrupted))
+    with pytest.raises(KeyboardInterrupt), cli.user_errors([]):
+        failing()
+    assert capsys.readouterr().err == ""
+
+
 def test_an_error_goes_from_a_process_to_another():
     error = pickle.loads(pickle.dumps(PlantError("mine", "control step 3", "KeyError: 'x'")))
     assert str(error) == "plant mine, control step 3: KeyError: 'x'"

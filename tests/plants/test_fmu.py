@@ -196,6 +196,17 @@ def test_a_description_that_breaks_the_standard_is_told_whole_or_taken_as_it_is(
         sources.add(f"fmu:{path}", PlantOptions(input="r_tilde", validate=False))
 
 
+def test_a_control_step_is_a_multiple_of_a_fixed_step_size(tmp_path):
+    fixed = [
+        ('<DefaultExperiment stepSize="0.1"/>', ""),
+        ("<CoSimulation", '<CoSimulation fixedInternalStepSize="0.05"'),
+    ]
+    path = compiled(tmp_path, "lag_fmi3", platform_tuple, changes=fixed)
+    with pytest.raises(ValueError, match=r"--control-step is 0.12; .* multiple of the FMU's fixed .* 0.05 s"):
+        sources.add(f"fmu:{path}", PlantOptions(control_step=0.12))
+    assert plants.make(sources.add(f"fmu:{path}", PlantOptions(control_step=0.15)))[0].control_step == 0.15
+
+
 def test_an_episode_is_over_by_the_stop_time(tmp_path):
     plant, _ = plants.make(sources.add(f"fmu:{faulty(tmp_path, 'STOP=10')}"))
     assert (plant.episode_steps, plant.family_steps) == (100, 100)
