@@ -40,13 +40,15 @@ class Options:
     """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, log:FILE, pitch or heaters."""
     figure: Path | None = None
     """File for the picture; default: none is drawn."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors(), ExitStack() as stack:
+    with cli.user_errors(arguments), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.check", args=arguments)
         figure = options.figure
         if figure is not None and not figure.resolve().parent.is_dir():

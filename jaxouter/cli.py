@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -29,11 +30,12 @@ from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.loop.identify import IdentificationWarning
-from jaxouter.plants.sources import FORMS, Source, add
+from jaxouter.plants.sources import FORMS, Source, add, own_errors
 from jaxouter.progress import Progress
 from jaxouter.training.config import OWN, PRESETS
 from jaxouter.training.run import RunWarning
 
+DEBUG = "--debug"
 NARROWEST = 20  # columns
 
 
@@ -60,17 +62,24 @@ console = Console(
 
 
 @contextmanager
-def user_errors() -> Iterator[None]:
-    """A ValueError in here is the user's mistake: one message, exit status 2."""
+def user_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
+    """A ValueError in here is the user's mistake, or a plant's: one message, exit status 2.
+
+    Args:
+        arguments: of the command; None: those of the program. With `--debug` among them the trace is shown too.
+    """
     warnings.simplefilter("always", RunWarning)
     warnings.simplefilter("once", IdentificationWarning)
     warnings.showwarning = show
     try:
-        yield
+        with own_errors():
+            yield
     except Exception as error:
         message = missing_backend() or (str(error) if isinstance(error, ValueError) else None)
         if message is None:
             raise
+        if DEBUG in (sys.argv[1:] if arguments is None else arguments):
+            traceback.print_exception(error)
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(2) from None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import datetime
+import os
 import shlex
 import sys
 import time
@@ -17,9 +18,10 @@ from typing import Annotated, Any
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import board, comparison, report, scenarios, statistics, sweeps
+from jaxouter.evaluation import board, comparison, pace, report, scenarios, statistics, sweeps
 from jaxouter.evaluation.board import Contender, Done, Job
-from jaxouter.plants import Plant
+from jaxouter.evaluation.rivals import BUDGET, SIMPLE
+from jaxouter.plants import Plant, host
 from jaxouter.plants.sources import SOURCES
 from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, open_run, surroundings, write_json
@@ -51,6 +53,8 @@ class Options:
     """Seed of the reference families."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the results, which must not exist; default: runs/compare-PLANT."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print plants, presets, scenarios, sweeps and policies, and end."""
 
@@ -72,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     begun = time.perf_counter()
     arguments = sys.argv[1:] if arguments is None else arguments
     with ExitStack() as stack:
-        with cli.user_errors():
+        with cli.user_errors(arguments):
             options = tyro.cli(Options, prog="python -m jaxouter.compare", args=arguments)
             if options.list:
                 return cli.print_lists()
@@ -171,8 +175,26 @@ def folder(out: Path | None, plant: str) -> Path:
     return next(p for p in (base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))) if not p.exists())
 
 
+def told(plan: Plan) -> str | None:
+    """How long a plant outside JAX is going to take, where that is long."""
+    each = host.step_seconds(plants.make(plan.plant)[0])
+    if each is None:
+        return None
+    tuned = [c for c in plan.contenders if c.kind == "rival" and c.name not in SIMPLE]
+    seconds = each * BUDGET * len(tuned) + pace.seconds(plan.scenarios, None, len(plan.contenders))
+    seconds /= min(os.cpu_count() or 1, len(plan.contenders))
+    if seconds < pace.SAID:
+        return None
+    return (
+        f"the plant takes {1e3 * each:.2g} ms a control step: up to {pace.duration(seconds)}, where nothing of it is "
+        "in the cache; --policy and --scenario take fewer"
+    )
+
+
 def work(plan: Plan, progress: Progress) -> list[Done]:
     """All jobs done, in their order, with progress."""
+    if (text := told(plan)) is not None:
+        print(text, flush=True)
     jobs = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
     done: dict[Job, Done] = {}
     shares: dict[Job, float] = {}  # of each that has begun

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import board, scenarios
+from jaxouter.evaluation import board, pace, scenarios
 from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
 from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS
 from jaxouter.progress import Progress
@@ -55,13 +55,15 @@ class Options:
     """Write all figures of merit to this file."""
     traces: Path | None = None
     """Write r, y and r~ of each scenario, (episodes, T) each, to this npz file."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors(), ExitStack() as stack:
+    with cli.user_errors(arguments), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
@@ -76,6 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         foreign = [name for name in names if name.split("/")[0] not in policies]
         if foreign:
             raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
+        rollouts = 1 if options.policy == "none" else 2
+        if pace.seconds(names, options.episodes, rollouts) > pace.SAID:
+            progress.print(f"{pace.told(names, options.episodes, rollouts)}; --episodes N is N of each")
         met = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
         results = evaluated(policies, met, options.policy, progress)
     named = next(iter(policies.values()))

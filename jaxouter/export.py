@@ -40,17 +40,18 @@ class Options:
     """File to write, which must not exist; default: controller.FORMAT in the folder."""
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Export what was learned even where the run found it to be worse than r~ = r or the static prefilter."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with ExitStack() as stack:
-        with cli.user_errors():
-            options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
-            run_path, kind, out = check(options)
-            run, seed, _ = open_run(run_path)
-            cli.use_compilation_cache()
-            state, _ = run.load(seed)
+    with cli.user_errors(arguments), ExitStack() as stack:
+        options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
+        run_path, kind, out = check(options)
+        run, seed, _ = open_run(run_path)
+        cli.use_compilation_cache()
+        state, _ = run.load(seed)
         trainer, _ = run.trainer
         policy, params = trainer.policy, trainer.policy_params(state)
         law = Law.of(policy, params, trainer.env.plant)

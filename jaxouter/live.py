@@ -19,6 +19,7 @@ from jaxouter import cli
 from jaxouter.deploy.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
 from jaxouter.deploy.realtime import Loop, Row, Settings, StepError, run
 from jaxouter.evaluation import figures
+from jaxouter.plants.errors import Raised
 from jaxouter.plants.sources import attribute
 from jaxouter.progress import Progress
 from jaxouter.training.run import add_plant, write_json
@@ -55,11 +56,13 @@ class Options:
     """Most updates a period."""
     plant: str | None = None
     """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors(), ExitStack() as stack:
+    with cli.user_errors(arguments), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.live", args=arguments)
         plant = check(options)
         if options.plant is not None:
@@ -105,7 +108,7 @@ def check(options: Options) -> Callable[[float], Any]:
     else:
         try:
             found = getattr(importlib.import_module(file), name)
-        except Exception as error:  # whatever the module raises
+        except Raised as error:  # whatever the module raises
             raise ValueError(f"{options.step} can't be imported: {error}") from None
     if not callable(found):
         raise ValueError(f"{options.step} is {found!r}; it must be a function of r~ that gives y")

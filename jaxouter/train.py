@@ -9,8 +9,9 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -18,14 +19,15 @@ import jax
 import numpy as np
 import tyro
 
-from jaxouter import cli
-from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
+from jaxouter import cli, plants
+from jaxouter.evaluation import figures, pace, scenarios
+from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
-from jaxouter.plants.sources import add
+from jaxouter.plants.errors import PlantError
+from jaxouter.plants.sources import add, own_errors
 from jaxouter.progress import Progress, clock
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.choice import choose
@@ -39,6 +41,7 @@ from jaxouter.training.trainer import Trainer, TrainState
 
 LOOK_SECONDS = 5.0  # between two looks at the MAE during the pretraining, at least
 FRESH = 4  # folded into a key
+WATCHING = 0.1  # of the time of learning so far, which the first look at the MAE may take of a plant outside JAX
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Options:
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
     """Go on with the run in this folder; takes no other option but a plant of your own, which is named
-    again, --tensorboard, --dry-run, --devices (draws go on
+    again, --episodes, --tensorboard, --dry-run, --debug, --devices (draws go on
     otherwise where a learner then spans another number of them) and how to find the other processes."""
     coordinator: str | None = None
     """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
@@ -63,10 +66,15 @@ class Options:
     """Processes in all, each started with the same options but its own --process-id."""
     process_id: int | None = None
     """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
+    episodes: int | None = None
+    """Episodes of each scenario after the training; default: its own number, on a plant outside JAX (gym:, fmu:) as
+    many as take no longer than the learning did."""
     tensorboard: bool = False
     """Write the metrics as TensorBoard events too, beside metrics.jsonl; needs the extra `tensorboard`."""
     dry_run: bool = False
     """Print configuration, shapes, memory and arithmetic, and end before any work."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show the trace of an error too."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 
@@ -83,7 +91,7 @@ def parse(arguments: list[str]) -> Options:
     if options.resume is not None:
         execution = {
             name: getattr(options, name)
-            for name in ("resume", "dry_run", "tensorboard", *Processes.__dataclass_fields__)
+            for name in ("resume", "dry_run", "tensorboard", "debug", "episodes", *Processes.__dataclass_fields__)
         }
         config = dataclasses.replace(
             preset(plant), devices=options.config.devices, plant_options=options.config.plant_options
@@ -91,7 +99,7 @@ def parse(arguments: list[str]) -> Options:
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
                 "--resume takes no other option but a plant of your own, --devices, --coordinator, --num-processes, "
-                "--process-id, --tensorboard and --dry-run: the run folder holds them all"
+                "--process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds them all"
             )
         run = Run.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
@@ -106,12 +114,14 @@ def parse(arguments: list[str]) -> Options:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     begun = time.perf_counter()
-    with cli.user_errors():
+    with cli.user_errors(arguments):
         options = parse(sys.argv[1:] if arguments is None else arguments)
         if options.list:
             return cli.print_lists()
         cli.use_compilation_cache()
         config = options.config.check()
+        if options.episodes is not None and options.episodes < 1:
+            raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
         if options.dry_run:
             config = config if options.resume is not None else chosen(config)
             lines = plan(config).lines
@@ -131,16 +141,23 @@ def main(arguments: list[str] | None = None) -> None:
             run = Run(Path(path), config)
             devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
             try:
-                finals = learn(run, options, progress, planned.flop)
-                if devices.is_first() and finals is not None:
-                    report(run, finals, begun, progress)
+                new = options.resume is None and devices.is_first()
+                with own_errors():
+                    with run.gone_if_nothing_is_learned() if new else nullcontext():
+                        finals = learn(run, options, progress, planned.flop)
+                    if devices.is_first() and finals is not None:
+                        report(run, finals, begun, progress, options.episodes)
+            except PlantError as error:
+                kept = f"; what was learned is in {run.path}" if run.path.exists() else ""
+                raise ValueError(f"{error}{kept}") from error
             except (OSError, NotFiniteError) as error:
-                raise SystemExit(f"error: {error}; what was saved before is whole, {go_on(run)}") from None
+                saved = f"what was saved before is whole, {go_on(run)}" if run.path.exists() else "nothing was saved"
+                raise SystemExit(f"error: {error}; {saved}") from None
             except KeyboardInterrupt:  # the second one, or after the training
                 finals = None
     if finals is None:
         if devices.is_first():
-            print(f"saved; {go_on(run)}", file=sys.stderr)
+            print(f"saved; {go_on(run)}" if run.path.exists() else "nothing was saved", file=sys.stderr)
         raise SystemExit(130)
 
 
@@ -172,14 +189,18 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
     if devices.is_first():
         for change in run.changes() if options.resume is not None else ():
             print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
-    watched = scenarios.get(scenarios.paper_scenarios(config.plant)[0])
+    begun, first = time.perf_counter(), scenarios.paper_scenarios(config.plant)[0]
+
+    @cache
+    def watched() -> scenarios.Scenario:
+        return scenarios.get(first, pace.affordable([first], 1, WATCHING * (time.perf_counter() - begun)))
 
     def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
         # With the single outputs only because the report asks for them too, in the same compiled function.
-        traces = rollout(trainer.policy, trainer.policy_params(state), watched, record_members=True)
+        traces = rollout(trainer.policy, trainer.policy_params(state), watched(), record_members=True)
         return {"mae": mae(traces)}
 
-    shown = Learning(progress, config, watched, flop)
+    shown = Learning(progress, config, first, flop)
     stopping = cli.Interrupt("what runs now ends, then everything is saved")
     with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
@@ -198,11 +219,10 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
 class Learning:
     """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
 
-    def __init__(
-        self, progress: Progress, config: TrainConfig, watched: scenarios.Scenario, flop: tuple[float, float]
-    ) -> None:
-        """Args: watched: what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
+    def __init__(self, progress: Progress, config: TrainConfig, watched: str, flop: tuple[float, float]) -> None:
+        """Args: watched: id of what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
         self._progress, self._config, self._watched = progress, config, watched
+        self._plant = plants.make(config.plant)[0]
         start, updates = config.pretraining.gradient_steps, config.total_updates
         self._gradient_steps, self._weights = config.seeds * (start + updates), flop
         self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))
@@ -214,7 +234,7 @@ class Learning:
     def begins(self, what: str, done: int, of: int) -> None:
         """What is going on before gradient steps; so much of it is done."""
         if what != self._what:
-            slow = counter([self._watched.plant])
+            slow = counter([self._plant])
             if slow is not None and what == "recording":
                 self._progress.phase(what, self._config.identification_steps, counter=slow)
             elif slow is not None and self._what == "recording":
@@ -226,7 +246,7 @@ class Learning:
 
     def pretrained(self, seed: int, at: Rehearsal, look: Callable[[], Row]) -> None:
         """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
-        if self._watched.plant.differentiable:
+        if self._plant.differentiable:
             if self._pace.due():
                 self._maes[seed] = cli.number(self._pace.do(look)["mae"])
         elif math.isfinite(at.best):
@@ -265,26 +285,33 @@ class Learning:
             return ""
         every = self._maes.items() if len(self._done) > 1 else ()
         found = ", ".join(f"seed {seed} {mae}" for seed, mae in sorted(every)) or next(iter(self._maes.values()))
-        unit = "" if self._watched.plant.y_unit == "1" else f" {self._watched.plant.y_unit}"
-        return f"MAE {found}{unit} on {self._watched.id}"
+        unit = "" if self._plant.y_unit == "1" else f" {self._plant.y_unit}"
+        return f"MAE {found}{unit} on {self._watched}"
 
 
-def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress) -> None:
+def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress, episodes: int | None) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, params) = run.config.plant, run.trainer
-    met = [scenarios.get(identifier) for identifier in scenarios.paper_scenarios(plant)]
-    names = [*SIMPLE, *("learned" for _ in finals)]
-    total = sum(work(name, scenario) for name in names for scenario in met)
+    seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / run.config.side_by_side
+    identifiers, rollouts = scenarios.paper_scenarios(plant), len(finals) + len(SIMPLE)
+    if episodes is None:
+        episodes = pace.affordable(identifiers, rollouts, seconds)
+        if episodes is not None and episodes < scenarios.FAMILY_MEMBERS:
+            text = pace.told(identifiers, episodes, rollouts)
+            progress.print(f"evaluation: {text}, as long as learning took at most; --episodes sets another number")
+    met = [scenarios.get(identifier, episodes) for identifier in identifiers]
+    total = rollouts * sum(scenario.r.size for scenario in met)
     progress.phase("evaluating", total, counter=counter([met[0].plant]))
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
     simple = {name: rival(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
 
-    def evaluated(named: Named) -> Results:
-        return evaluate(named, met, True, lambda scenario: progress.advance(work(named.name, scenario)))
+    def evaluated(named: Named, alone: Results | None) -> Results:
+        return evaluate(named, met, True, alone, lambda scenario: progress.advance(scenario.r.size))
 
-    simple_results = {name: evaluated(named) for name, named in simple.items()}
-    learned = {seed: evaluated(named) for seed, named in policies.items()}
+    alone = evaluated(simple["none"], None)
+    simple_results = {name: alone if name == "none" else evaluated(named, alone) for name, named in simple.items()}
+    learned = {seed: evaluated(named, alone) for seed, named in policies.items()}
     by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
@@ -294,12 +321,12 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     summary = {
         "format": FORMAT,
         "median_seed": median,
-        "training_seconds": sum(row["seconds"] for seed in run.seeds for row in run.rows(seed))
-        / run.config.side_by_side,
+        "training_seconds": seconds,
         "steps": run.config.steps,
         "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
         "places": places,
+        "episodes": {scenario.id: len(scenario.r) for scenario in met},
         "verdict": verdict,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
@@ -32,7 +33,8 @@ from jaxouter.evaluation.rivals.tuning import Report
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import Plant, make
-from jaxouter.plants.sources import attribute
+from jaxouter.plants.errors import PlantError
+from jaxouter.plants.sources import attribute, own_errors
 from jaxouter.training.run import Run
 
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
@@ -117,6 +119,8 @@ def blamed(name: str, what: str, own: bool = True) -> Iterator[None]:
     """Turns whatever a user's own policy raises in here into a ValueError that names it."""
     try:
         yield
+    except PlantError:
+        raise
     except Exception as error:
         if not own:
             raise
@@ -178,8 +182,13 @@ def run(job: Job, report: Report = lambda text, share: None) -> Done:
     """Do one job.
 
     Raises:
-        ValueError: it can't be done, or a user's policy failed at it.
+        ValueError: it can't be done, or a user's policy or plant failed at it.
     """
+    with own_errors():
+        return _run(job, report)
+
+
+def _run(job: Job, report: Report) -> Done:
     begin, c = time.perf_counter(), job.contender
     work = {"meet": meet, "sweep": sweep, "certify": certify}.get(job.what)
     report("", 0.0)
@@ -188,7 +197,7 @@ def run(job: Job, report: Report = lambda text, share: None) -> Done:
     elif c.kind == "learned":
         found = work(c, job.plant, job.on, job.family_seed)
     elif c.kind == "user":
-        with blamed(c.name, f"failed on {job.on}"):
+        with blamed(c.name, f"failed on {job.on}"), own_errors():
             found = work(c, job.plant, job.on, job.family_seed)
     else:
         key = {"on": job.on, "family_seed": job.family_seed}
@@ -294,6 +303,10 @@ def spread(
                         with _starting():
                             waiting |= {pool.submit(_Worker.run, job) for job in freed}
                     yield finished
+        except BrokenProcessPool:
+            raise ValueError(
+                "a process of the comparison ended at once: memory ran out, or a library crashed"
+            ) from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():

@@ -43,8 +43,7 @@ def work(name: str, scenario: Scenario) -> int:
 
 def counter(plants: Iterable[Plant]) -> Callable[[], float] | None:
     """Control steps that the simulators of plants outside JAX have made so far; None where there are none."""
-    of = getattr(host, "of", lambda plant: None)
-    simulators = list(filter(None, map(of, plants)))
+    simulators = list(filter(None, map(host.of, plants)))
     return (lambda: sum(each.speed.steps for each in simulators)) if simulators else None
 
 
@@ -52,13 +51,23 @@ def evaluate(
     named: Named,
     scenarios: Iterable[Scenario],
     record_members: bool = False,
+    alone: Results | None = None,
     report: Callable[[Scenario], None] = lambda scenario: None,
 ) -> Results:
-    """Traces (with the single outputs where asked for) and figures of merit on each scenario; `report` hears of it."""
+    """Traces and figures of merit on each scenario.
+
+    Args:
+        named: the policy.
+        scenarios: on which.
+        record_members: with the single outputs.
+        alone: what this gave of `none` on the same scenarios; None: it is run here.
+        report: hears of each scenario when it is done.
+    """
     results = {}
     for scenario in scenarios:
         traces = rollout(named.policy, named.params, scenario, record_members)
-        inner = traces if named.name == "none" else rollout(*none(scenario.plant), scenario, record_members)
+        inner = traces if named.name == "none" else None if alone is None else alone[scenario.id][0]
+        inner = rollout(*none(scenario.plant), scenario, record_members) if inner is None else inner
         results[scenario.id] = traces, figures_of_merit(traces, scenario, mae(inner))
         report(scenario)
     return results

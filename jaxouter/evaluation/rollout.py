@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from jaxouter.loop import rewards, sensor
 from jaxouter.loop.policy import Policy
 from jaxouter.loop.rewards import RewardParams
 from jaxouter.loop.sensor import SensorParams
-from jaxouter.plants import Plant
+from jaxouter.plants import Plant, host
 
 
 class Traces(NamedTuple):
@@ -135,6 +136,18 @@ def _rollout(
     return jax.vmap(episode, (0 if per_episode else None, _axes(inputs), 0, 0))(policy_params, inputs, r, keys)
 
 
+def some(scenario: Scenario, first: int, end: int) -> Scenario:
+    """Some of the episodes of a scenario."""
+    change = None if scenario.change is None else (scenario.change[0], _some(scenario.change[1], first, end))
+    sensor = jax.tree.map(lambda leaf: leaf[first:end] if jnp.ndim(leaf) else leaf, scenario.sensor)
+    episodes = {name: _some(getattr(scenario, name), first, end) for name in ("params", "r", "keys")}
+    return replace(scenario, change=change, sensor=sensor, **episodes)
+
+
+def _some(tree: Any, first: int, end: int) -> Any:
+    return jax.tree.map(itemgetter(slice(first, end)), tree)
+
+
 def rollout(
     policy: Policy,
     policy_params: Any,
@@ -155,6 +168,13 @@ def rollout(
     Returns:
         Traces as NumPy arrays.
     """
+    most, episodes = host.side_by_side(scenario.plant), len(scenario.r)
+    if most is not None and episodes > most:
+        parts = []
+        for i in range(0, episodes, most):
+            own = _some(policy_params, i, i + most) if per_episode else policy_params
+            parts.append(rollout(policy, own, some(scenario, i, i + most), record_members, per_episode))
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     plant = scenario.plant
     change = None if scenario.change is None else (jnp.asarray(scenario.change[0]), scenario.change[1])
     inputs = _Inputs(scenario.params, change, scenario.sensor, rewards.params(plant))

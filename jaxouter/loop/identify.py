@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from jaxouter.loop.observation import HISTORY
 from jaxouter.loop.policy import Affine, AffineParams, none
 from jaxouter.loop.references import telegraph
-from jaxouter.plants import Plant, simulate
+from jaxouter.plants import Plant, host, simulate
 from jaxouter.plants.arx import Model
 
 LEVELS = 8
@@ -36,6 +36,10 @@ STEADY = (0.97, 1.05)  # ratio of the changes in two such fifths, where y grows 
 ENOUGH = 20  # past samples in an observation, of a high order
 BEYOND = 8  # of them beyond a long dead time
 BAND = 0.05  # of the step, for the settling time
+SIGNIFICANT = 3.0  # standard errors, by which y must have moved with r~
+TINY = 1e-3  # of the span of the set-points, by which all of r~ must move y
+LONGER = 5  # episodes, in which y is seen to move at last
+ROUNDING = 1e-6  # of y
 RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
 
 
@@ -62,8 +66,10 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
     Each starts like a training episode; a line is fitted through the last tenth of each.
 
     Raises:
-        ValueError: y did not depend on r~, or was not finite.
+        ValueError: y does not tell how it answers to r~; says why.
     """
+    if (simulators := host.of(plant)) is not None:
+        simulators.ended = None
     levels, y, course = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
     end = finite_steps(course, plant.divergence_bounds)
     if end < course.shape[1]:  # it ran away
@@ -71,9 +77,9 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
         y = course[:, -max(1, end // 10) :].mean(1)
     centred = levels - np.mean(levels)
     gain = np.sum(centred * y) / np.sum(centred**2)
-    if not np.isfinite(gain) or abs(gain) < 1e-6:
-        bounds = plant.r_tilde_bounds
-        raise ValueError(f"the DC gain of {plant.name} came out as {gain}: no r~ in {bounds} moves its output")
+    why = unanswered(plant, params, key, levels, y, course, float(gain))
+    if why is not None:
+        raise ValueError(f"the DC gain of {plant.name} can't be found: {why}")
     rate, still = _rate(levels, course)
     found = unsettled(levels, course)
     return DcGain(
@@ -154,6 +160,90 @@ def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, ja
     return levels, *jax.vmap(episode)(levels, jax.random.split(key, LEVELS))
 
 
+def unanswered(
+    plant: Plant,
+    params: Any,
+    key: chex.PRNGKey,
+    levels: np.ndarray,
+    y: np.ndarray,
+    course: np.ndarray,
+    gain: float,
+) -> str | None:
+    """Why y does not tell how it answers to r~; None: it does.
+
+    Args:
+        plant, params: stepped again only where it seems not to.
+        key: of the starts.
+        levels: of r~ (8,), one an episode.
+        y: (8,), where it comes to under each.
+        course: (8, T + 1), y_0 to y_T.
+        gain: of the line through y.
+    """
+    steps = course.shape[1] - 1
+    broken = ~np.isfinite(course)
+    if broken.any():
+        k = int(broken.any(0).argmax())
+        level, value = levels[broken[:, k].argmax()], course[broken[:, k].argmax(), k]
+        ended = getattr(host.of(plant), "ended", None)
+        why = "" if ended is None else f": {ended}; choose --episode-steps so that an episode is over by then"
+        return f"y is {value} from control step {k} of {steps} on under r~ = {level:g}{why}"
+    (low, high), setpoints = plant.r_tilde_bounds, np.ptp(plant.setpoint_range)
+    # Where y began counts too: what is left of it at the end is no answer to r~.
+    causes = np.stack([np.ones(LEVELS), levels / (high - low), course[:, 0] / setpoints], 1)
+    effect, *_ = np.linalg.lstsq(causes, y / setpoints, rcond=None)
+    spread = np.std(y / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
+    if abs(effect[1]) > max(SIGNIFICANT * spread, TINY):
+        return None
+    moved = _moved(plant, params, key, levels, steps)
+    if not moved.any():
+        longer = _moved(plant, params, key, levels, LONGER * steps)
+        same = f"y is the same under {LEVELS} levels of r~ from {levels[0]:g} to {levels[-1]:g}"
+        if longer.any():
+            return (
+                f"{same} for {int((longer > 0).argmax())} control steps, its dead time, and an episode has {steps}: "
+                "make it several times as long as the dead time (episode_steps)"
+            )
+        return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
+    most = float(moved.max())
+    if most < TINY * setpoints:
+        return (
+            f"all of r~, {low:g} to {high:g} {plant.y_unit}, moves y by {most:.3g} {plant.y_unit}, and its set-points "
+            f"span {setpoints:.3g} {plant.y_unit}: a gain so small holds none of them"
+        )
+    if abs(gain) * (high - low) > TINY * setpoints:
+        return None  # in spite of the noise
+    return f"y does not move one way as r~ rises: it comes to {_numbers(y)} at r~ of {_numbers(levels)}"
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def _moved(plant: Plant, params: Any, key: chex.PRNGKey, levels: np.ndarray, steps: int) -> np.ndarray:
+    """By how much the levels of r~ move y apart, (T,), less rounding; as far as the plant goes on, at most `steps`.
+
+    All have the same start and noise.
+    """
+    try:
+        y = np.asarray(_together(plant, steps, params, key, levels))
+    except (ValueError, jax.errors.JaxRuntimeError):  # a simulator that does not go on
+        return np.zeros(plant.episode_steps)
+    y = y[:, : int(np.append(~np.isfinite(y).all(0), True).argmax())]
+    return np.where(np.ptp(y, 0) > ROUNDING * np.abs(y).max(initial=0.0), np.ptp(y, 0), 0.0)
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=RUN_ONCE)
+def _together(plant: Plant, steps: int, params: Any, key: chex.PRNGKey, levels: jax.Array) -> jax.Array:
+    """Y (8, T) under constant levels of r~ (8,), with the same start and noise."""
+    key_start, key_run = jax.random.split(key)
+
+    def episode(level: jax.Array) -> jax.Array:
+        state = plant.training_start(key_start, params)
+        return simulate(plant, params, jnp.full(steps, level), key_run, state)
+
+    return jax.vmap(episode)(jnp.asarray(levels))
+
+
 def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, AffineParams]:
     """The static prefilter: the inverse of the identified affine DC gain, r~ = (r - offset) / gain.
 
@@ -191,8 +281,9 @@ def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Recor
     Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
     log-uniform from four times an episode to every other step.
     """
-    r_tilde, y = _episodes(plant, params, jax.random.split(key, episodes))
-    return Record(np.asarray(r_tilde, np.float64), np.asarray(y, np.float64))
+    keys, n = jax.random.split(key, episodes), host.side_by_side(plant) or episodes
+    parts = [_episodes(plant, params, keys[i : i + n]) for i in range(0, episodes, n)]
+    return Record(*(np.concatenate(column).astype(np.float64) for column in zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)

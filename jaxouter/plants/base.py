@@ -10,6 +10,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxouter.plants import declaration
+
 MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
 
 
@@ -107,22 +109,29 @@ class Plant:
     """`widened(params, ranges) -> params`: the same plant, so made that its numbers may lie in these ranges."""
 
     def __post_init__(self) -> None:
+        self._take("r_tilde_bounds", "setpoint_range")
         low, high = self.r_tilde_bounds
         beyond = 2 * (high - low)
-        if self.move_threshold is None:
-            object.__setattr__(self, "move_threshold", MOVE * (high - low))
-        if self.error_scale == 0.0:
+        if isinstance(self.error_scale, int | float) and self.error_scale == 0:
             object.__setattr__(self, "error_scale", (self.setpoint_range[1] - self.setpoint_range[0]) / 20)
-        object.__setattr__(self, "evaluation_range", self.evaluation_range or self.setpoint_range)
-        object.__setattr__(self, "divergence_bounds", self.divergence_bounds or (low - beyond, high + beyond))
-        for field in ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds"):
-            low, high = getattr(self, field)
-            if not low < high:
-                raise ValueError(f"plant {self.name!r}: {field} is {(low, high)}; the first must be below the second")
-        if self.control_step <= 0 or self.episode_steps < 1:
-            raise ValueError(f"plant {self.name!r}: control_step and episode_steps must be positive")
+        defaults = {
+            "move_threshold": MOVE * (high - low),
+            "evaluation_range": self.setpoint_range,
+            "divergence_bounds": (low - beyond, high + beyond),
+        }
+        for field, value in defaults.items():
+            given = getattr(self, field)
+            if given is None or (isinstance(given, tuple) and not given):
+                object.__setattr__(self, field, value)
+        self._take(*declaration.PLANT)
         if (self.variables is float_leaves) != (self.settled is with_float_leaves):
             raise ValueError(f"plant {self.name!r}: variables and settled are inverse; declare both or neither")
+
+    def _take(self, *fields: str) -> None:
+        """Each of these fields as it is meant."""
+        for field in fields:
+            value = declaration.checked(declaration.PLANT[field], f"plant {self.name!r}: {field}", getattr(self, field))
+            object.__setattr__(self, field, value)
 
     def training_start(self, key: chex.PRNGKey, params: Any) -> Any:
         """State at the start of a training episode."""

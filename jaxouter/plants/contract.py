@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -10,7 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxouter.plants import host
 from jaxouter.plants.base import Plant
+from jaxouter.plants.declaration import shown
+from jaxouter.plants.errors import PlantError, said
 
 LANES = 4  # plants side by side under vmap
 STEPS = 20  # that are compared
@@ -31,22 +35,34 @@ def shapes(plant: Plant, params: Any) -> None:
             raise ValueError(f"parameters must be a pytree of arrays and numbers; one of them is {leaf!r}")
     state = _traced("init(key, params)", plant.init, key, params)
     starts = [state] if plant.start is None else [state, _traced("start(key, params)", plant.start, key, params)]
+    given = jax.eval_shape(lambda: params)
     if plant.draw is not None:
-        _same("draw(key, params)", "params", jax.eval_shape(lambda: params), _traced("draw", plant.draw, key, params))
+        _same("draw(key, params)", "params", given, _traced("draw(key, params)", plant.draw, key, params))
     for begun in starts:
         after = _traced("step(params, state, r_tilde, key)", plant.step, params, begun, r_tilde, key)
         _same("step(params, state, r_tilde, key)", "state", state, after)
+    float_ = jax.ShapeDtypeStruct((), jnp.result_type(float))
     y = _traced("output(params, state)", plant.output, params, state)
-    if not isinstance(y, jax.ShapeDtypeStruct) or y.shape or not jnp.issubdtype(y.dtype, jnp.floating):
-        raise ValueError(f"output(params, state) gave {_of(y)}; y must be one floating-point number, of shape ()")
+    if not isinstance(y, jax.ShapeDtypeStruct) or (y.shape, y.dtype) != (float_.shape, float_.dtype):
+        raise ValueError(f"output(params, state) gave {_of(y)}; y must be one number of shape (), {float_.dtype}[]")
+    _same("reuse(old, fresh)", "state", state, _traced("reuse(old, fresh)", plant.reuse, state, state))
+    _same("noise_free(params)", "params", given, _traced("noise_free(params)", plant.noise_free, params))
+    variables = _traced("variables(params, state)", plant.variables, params, state)
+    settled = _traced("settled(params, state, variables)", plant.settled, params, state, variables)
+    _same("settled(params, state, variables)", "state", state, settled)
+    if plant.members is not None:
+        each = _of(_traced("members(params, state)", plant.members, params, state))
+        if not re.fullmatch(rf"{float_.dtype}\[\d+\]", each):
+            raise ValueError(f"members(params, state) gave {each}; it must be one array of shape (n,), {float_.dtype}")
 
 
 def _traced(name: str, function: Callable[..., Any], *args: Any) -> Any:
     try:
         return jax.eval_shape(function, *args)
+    except PlantError as error:
+        raise ValueError(f"{name} failed: {error.what}") from error
     except Exception as error:
-        first = str(error).strip().partition("\n")[0]
-        raise ValueError(f"{name} failed: {type(error).__name__}: {first}") from error
+        raise ValueError(f"{name} failed: {said(error)}") from error
 
 
 def _same(name: str, what: str, wanted: Any, got: Any) -> None:
@@ -60,7 +76,7 @@ def _same(name: str, what: str, wanted: Any, got: Any) -> None:
 
 def _of(value: Any) -> str:
     leaves = jax.tree.leaves(value)
-    return ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves if hasattr(leaf, "dtype")) or repr(value)
+    return ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves if hasattr(leaf, "dtype")) or shown(value)
 
 
 def behaviour(plant: Plant, params: Any) -> Iterator[tuple[str, str | None]]:
@@ -82,12 +98,15 @@ def behaviour(plant: Plant, params: Any) -> Iterator[tuple[str, str | None]]:
         state = plant.training_start(key_start, params)
         return jax.lax.scan(step, state, (r_tilde, jax.random.split(key_run, r_tilde.size)))[1]
 
+    if (simulators := host.of(plant)) is not None:
+        simulators.ended = None
     compiled = jax.jit(run)
     y = np.asarray(compiled(params, keys[0], r_tilde))
     wrong = np.flatnonzero(~np.isfinite(y))
+    why = f": {simulators.ended}" if simulators is not None and simulators.ended else ""
     yield (
         "finite under random r~",
-        f"y is {y[wrong[0]]} after {wrong[0] + 1} of {y.size} control steps" if wrong.size else None,
+        f"y is {y[wrong[0]]} after {wrong[0] + 1} of {y.size} control steps{why}" if wrong.size else None,
     )
     again = np.asarray(compiled(params, keys[0], r_tilde))
     yield "the same again from the same key", None if np.array_equal(y, again, equal_nan=True) else _off(y, again)

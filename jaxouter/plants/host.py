@@ -8,10 +8,13 @@ from the same seed. Nothing here is differentiable.
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from array import array
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import chex
@@ -20,13 +23,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxouter.plants.base import Plant
+from jaxouter.plants.errors import PlantError, Raised, said
 
 SIMULATORS = 256  # that are kept going
+TRIED = 20  # control steps by which the speed is measured where none were made yet
 START = -1  # in place of an older moment
 
 
 class Simulator(Protocol):
-    """A closed loop elsewhere. The same from the same seed, and nan from where it can't go on."""
+    """A closed loop elsewhere. The same from the same seed, and nan from where it can't go on.
+
+    It may have an attribute `ended`: None, or why it can't go on.
+    """
 
     def reset(self, seed: int) -> float:
         """Begin an episode: y_0."""
@@ -44,27 +52,54 @@ class HostState(NamedTuple):
     y: jax.Array
 
 
+class Speed(NamedTuple):
+    """What a plant outside JAX has taken so far."""
+
+    steps: int  # control steps
+    seconds: float  # in its code
+
+    @property
+    def step_seconds(self) -> float:
+        """Seconds a control step."""
+        return self.seconds / self.steps if self.steps else math.nan
+
+
 class Moments:
     """The simulators of one plant, by the moment at which each is."""
 
-    def __init__(self, make: Callable[[], Simulator]) -> None:
-        self._make = make
+    def __init__(self, name: str, make: Callable[[], Simulator], side_by_side: int) -> None:
+        """Args: name: of the plant; make: a new simulator; side_by_side: episodes that may be under way at a time."""
+        self.name, self.side_by_side = name, side_by_side
+        self.ended: str | None = None
+        """Where and why an episode could not go on: the first since this was None."""
+        self._make, self._kept = make, side_by_side
         self._before = array("i")  # the moment from which each came
         self._by = array("d")  # by which r~; at a start, from which seed
         self._at: OrderedDict[int, Simulator] = OrderedDict()
         self._lock = threading.Lock()
+        self._steps, self._seconds = 0, 0.0
 
-    def begin(self, seed: int) -> tuple[int, float]:
-        """A new episode: its first moment, and y."""
+    @property
+    def speed(self) -> Speed:
+        """Control steps so far, those of episodes that were gone through again included, and their time."""
+        return Speed(self._steps, self._seconds)
+
+    def begin(self, seeds: list[int]) -> list[tuple[int, float]]:
+        """New episodes side by side: the first moment of each, and y."""
+        self._kept = max(self._kept, 2 * len(seeds))  # as a new episode begins while others are under way
+        return [self._begin(seed) for seed in seeds]
+
+    def _begin(self, seed: int) -> tuple[int, float]:
         with self._lock:
-            simulator = self._free()
-            return self._new(START, seed, simulator), simulator.reset(seed)
+            simulator = self._free(seed)
+            y = self._reset(simulator, seed)
+            return self._new(START, seed, simulator), y
 
     def step(self, moment: int, r_tilde: float) -> tuple[int, float]:
         """The moment after one control step, and y."""
         with self._lock:
             simulator = self._at.pop(moment, None) or self._again(moment)
-            y = simulator.step(r_tilde)
+            y = self._step(simulator, moment, r_tilde)
             return self._new(moment, r_tilde, simulator), y
 
     def _new(self, before: int, by: float, simulator: Simulator) -> int:
@@ -73,56 +108,138 @@ class Moments:
         self._at[len(self._before) - 1] = simulator
         return len(self._before) - 1
 
-    def _free(self) -> Simulator:
+    def _free(self, seed: int) -> Simulator:
         """A simulator: a new one, or that of the moment that was left alone for longest."""
-        return self._make() if len(self._at) < SIMULATORS else self._at.popitem(last=False)[1]
+        if len(self._at) >= self._kept:
+            return self._at.popitem(last=False)[1]
+        with self._guarded(lambda: f"at the start of the episode with seed {seed}"):
+            return self._make()
 
-    def _again(self, moment: int) -> Simulator:
+    def _reset(self, simulator: Simulator, seed: int) -> float:
+        with self._guarded(lambda: f"at the start of the episode with seed {seed}"):
+            return float(simulator.reset(seed))
+
+    def _step(self, simulator: Simulator, moment: int, r_tilde: float) -> float:
+        begun = time.perf_counter()
+        with self._guarded(lambda: f"{self._place(moment)}, r~ = {r_tilde:g}"):
+            y = float(simulator.step(r_tilde))
+        self._seconds += time.perf_counter() - begun
+        self._steps += 1
+        if self.ended is None and math.isnan(y):
+            self.ended = getattr(simulator, "ended", None)
+        return y
+
+    @contextmanager
+    def _guarded(self, where: Callable[[], str]) -> Iterator[None]:
+        try:
+            yield
+        except PlantError:
+            raise
+        except Raised as error:
+            raise PlantError(self.name, where(), said(error)) from error
+
+    def _history(self, moment: int) -> tuple[int, list[float]]:
+        """The seed of a moment's episode, and every r~ up to it."""
         inputs = []
         while (before := self._before[moment]) != START:
             inputs.append(self._by[moment])
             moment = before
-        simulator = self._free()
-        simulator.reset(int(self._by[moment]))
-        for r_tilde in reversed(inputs):
-            simulator.step(r_tilde)
+        return int(self._by[moment]), inputs[::-1]
+
+    def _place(self, moment: int) -> str:
+        """The control step that follows a moment, for people."""
+        seed, inputs = self._history(moment)
+        return f"control step {len(inputs) + 1} of the episode with seed {seed}"
+
+    def _again(self, moment: int) -> Simulator:
+        """A simulator that has gone through the episode up to a moment."""
+        seed, inputs = self._history(moment)
+        simulator = self._free(seed)
+        self._reset(simulator, seed)
+        at = []
+        while (before := self._before[moment]) != START:
+            moment = before
+            at.append(moment)
+        for before, r_tilde in zip(reversed(at), inputs, strict=True):
+            self._step(simulator, before, r_tilde)
         return simulator
 
 
-def plant(make: Callable[[], Simulator], **declared: Any) -> tuple[Plant, tuple[()]]:
+def plant(
+    make: Callable[[], Simulator], *, side_by_side: int = SIMULATORS, name: str, **declared: Any
+) -> tuple[Plant, tuple[()]]:
     """A plant around simulators, and its parameters: none.
 
     Args:
         make: a new simulator; called as often as episodes go on side by side.
-        **declared: of `Plant`, but for its functions.
+        side_by_side: episodes that had better be under way at a time.
+        name, **declared: of `Plant`, but for its functions.
     """
-    moments = Moments(make)
-    float_ = jnp.result_type(float)
-    result = jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), float_)
+    loop = _Loop(Moments(name, make, side_by_side))
+    return Plant(name, loop.init, loop.step, loop.output, differentiable=False, **declared), ()
 
-    def begin(seeds: Any) -> tuple[np.ndarray, np.ndarray]:
-        return _arrays([moments.begin(seed) for seed in np.ravel(seeds).tolist()], np.shape(seeds))
 
-    def advance(at: Any, r_tilde: Any) -> tuple[np.ndarray, np.ndarray]:
-        lanes = zip(np.ravel(at).tolist(), np.ravel(r_tilde).tolist(), strict=True)
-        return _arrays([moments.step(*lane) for lane in lanes], np.shape(at))
+class _Loop:
+    """The functions of such a plant."""
 
-    def _arrays(lanes: list[tuple[int, float]], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        moment, y = zip(*lanes, strict=True)
-        return np.asarray(moment, np.int32).reshape(shape), np.asarray(y, float_).reshape(shape)
+    def __init__(self, moments: Moments) -> None:
+        self.moments = moments
 
-    def init(key: chex.PRNGKey, params: Any) -> HostState:
+    def init(self, key: chex.PRNGKey, params: Any) -> HostState:
         del params
-        return HostState(
-            *jax.pure_callback(begin, result, jax.random.bits(key, (), jnp.uint32), vmap_method="broadcast_all")
-        )
+        seed = jax.random.bits(key, (), jnp.uint32)
+        return HostState(*jax.pure_callback(self._begin, _result(), seed, vmap_method="broadcast_all"))
 
-    def step(params: Any, state: HostState, r_tilde: jax.Array, key: chex.PRNGKey) -> HostState:
+    def step(self, params: Any, state: HostState, r_tilde: jax.Array, key: chex.PRNGKey) -> HostState:
         del params, key
-        return HostState(*jax.pure_callback(advance, result, state.moment, r_tilde, vmap_method="broadcast_all"))
+        inputs = state.moment, r_tilde
+        return HostState(*jax.pure_callback(self._advance, _result(), *inputs, vmap_method="broadcast_all"))
 
+    @staticmethod
     def output(params: Any, state: HostState) -> jax.Array:
         del params
         return state.y
 
-    return Plant(init=init, step=step, output=output, differentiable=False, **declared), ()
+    def _begin(self, seeds: Any) -> tuple[np.ndarray, np.ndarray]:
+        return _arrays(self.moments.begin(np.ravel(seeds).tolist()), np.shape(seeds))
+
+    def _advance(self, at: Any, r_tilde: Any) -> tuple[np.ndarray, np.ndarray]:
+        lanes = zip(np.ravel(at).tolist(), np.ravel(r_tilde).tolist(), strict=True)
+        return _arrays([self.moments.step(*lane) for lane in lanes], np.shape(at))
+
+
+def _result() -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+    return jax.ShapeDtypeStruct((), jnp.int32), jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+
+def _arrays(lanes: list[tuple[int, float]], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    moment, y = zip(*lanes, strict=True)
+    return np.asarray(moment, np.int32).reshape(shape), np.asarray(y, jnp.result_type(float)).reshape(shape)
+
+
+def of(plant: Plant) -> Moments | None:
+    """The simulators of a plant outside JAX, whose `speed` counts its control steps; None: its functions are JAX."""
+    loop = getattr(plant.step, "__self__", None)
+    return loop.moments if isinstance(loop, _Loop) else None
+
+
+def side_by_side(plant: Plant) -> int | None:
+    """Episodes of a plant that had better be under way at a time; None: as many as one likes."""
+    moments = of(plant)
+    return None if moments is None else moments.side_by_side
+
+
+def step_seconds(plant: Plant) -> float | None:
+    """Seconds that a control step of a plant outside JAX takes, measured where none was made yet; None: it is JAX.
+
+    Raises:
+        PlantError: the plant's own code failed.
+    """
+    moments = of(plant)
+    if moments is None:
+        return None
+    if moments.speed.steps < TRIED:
+        ((moment, _),) = moments.begin([0])
+        for _ in range(TRIED):
+            moment, _ = moments.step(moment, sum(plant.r_tilde_bounds) / 2)
+    return moments.speed.step_seconds

@@ -6,17 +6,27 @@ import atexit
 import importlib
 import inspect
 import math
+import multiprocessing
 import shutil
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxouter.plants import host
+from jaxouter.plants import declaration, host
 from jaxouter.plants.base import Plant
+from jaxouter.plants.cosimulation import Apart, FmuError, Instance, Setup
+from jaxouter.plants.errors import Raised, said
 
 EPISODE = 200  # control steps, where nothing says how long
+APART = 16  # episodes under way of an FMU that takes a process for each
+ROUNDING = 1e-6  # control steps
 
 
 @dataclass(frozen=True)
@@ -39,15 +49,24 @@ class PlantOptions:
     """Control steps of an episode; default: the environment's limit, else 200; of a log from its settling time."""
     y_unit: str | None = None
     """Unit of y and r~."""
+    validate: bool = True
+    """fmu: whether its description must keep to the standard."""
 
     def declared(self, **defaults: Any) -> dict[str, Any]:
         """The declaration: these where they are given, else the defaults.
 
         Raises:
-            ValueError: what has no default is not given, or is not a range or a positive number.
+            ValueError: what has no default is not given, or a value is not allowed; names the option.
         """
-        names = ("r_tilde_bounds", "setpoint_range", "control_step", "episode_steps", "y_unit")
-        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        kinds = {
+            name: declaration.PLANT[name] for name in ("setpoint_range", "control_step", "episode_steps", "y_unit")
+        }
+        kinds["r_tilde_bounds"] = declaration.RANGE
+        given = {
+            name: declaration.checked(kind, f"--{name.replace('_', '-')}", getattr(self, name))
+            for name, kind in kinds.items()
+            if getattr(self, name) is not None
+        }
         whole = defaults | given
         low, high = whole["r_tilde_bounds"]
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -55,8 +74,6 @@ class PlantOptions:
                 f"r~ lies between {low:g} and {high:g}: give it finite bounds, by --r-tilde-bounds LOW HIGH"
             )
         whole.setdefault("setpoint_range", ((3 * low + high) / 4, (low + 3 * high) / 4))
-        if not whole["control_step"] > 0 or whole["episode_steps"] < 1:
-            raise ValueError("--control-step and --episode-steps must be positive")
         return whole
 
 
@@ -76,33 +93,43 @@ def file_of(identifier: str) -> Path:
     """
     gymnasium = _gymnasium()
     module, _, identifier = identifier.rpartition(":")
-    try:
+    with _made(f"gym:{identifier}"):
         if module:
             importlib.import_module(module)
         entry = gymnasium.spec(identifier).entry_point
         creator = gymnasium.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
-    except (gymnasium.error.Error, ImportError, AttributeError) as error:
-        raise ValueError(f"gym:{identifier}: {str(error).partition(chr(10))[0]}") from None
     return Path(inspect.getsourcefile(creator) or "")
+
+
+@contextmanager
+def _made(what: str) -> Iterator[None]:
+    """Whatever making a simulator raises is a ValueError; it may be the code of others."""
+    try:
+        yield
+    except Raised as error:
+        raise ValueError(f"{what} can't be made: {said(error)}") from error
 
 
 class _Gym:
     """A Gymnasium environment whose action is r~; nan after its end."""
 
     def __init__(self, environment: Any, y_index: int) -> None:
-        self._environment, self._y_index, self._over = environment, y_index, False
+        self._environment, self._y_index, self._done = environment, y_index, 0
+        self.ended: str | None = None
 
     def reset(self, seed: int) -> float:
         obs, _ = self._environment.reset(seed=seed)
-        self._over = False
+        self._done, self.ended = 0, None
         return self._y(obs)
 
     def step(self, r_tilde: float) -> float:
-        if self._over:
+        if self.ended:
             return math.nan
         space = self._environment.action_space
         obs, _, terminated, truncated, _ = self._environment.step(np.full(space.shape, r_tilde, space.dtype))
-        self._over = bool(terminated or truncated)
+        self._done += 1
+        if terminated or truncated:
+            self.ended = f"the environment {'terminated' if terminated else 'truncated'} in control step {self._done}"
         return self._y(obs)
 
     def _y(self, obs: Any) -> float:
@@ -120,11 +147,12 @@ def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[P
     def make() -> Any:
         return gymnasium.make(identifier, max_episode_steps=-1, disable_env_checker=True)
 
-    try:
+    with _made(f"gym:{identifier}"):  # it may need packages that are not there
         first = make()
         limit = gymnasium.spec(identifier.rpartition(":")[2]).max_episode_steps
-    except (gymnasium.error.Error, ImportError) as error:  # it may need packages that are not there
-        raise ValueError(f"gym:{identifier}: {str(error).partition(chr(10))[0]}") from None
+        dt = getattr(first.unwrapped, "dt", None)
+    if dt is not None and options.control_step is None:
+        dt = declaration.checked(declaration.POSITIVE, f"gym:{identifier} has no --control-step, and its dt", dt)
     action, observation = first.action_space, first.observation_space
     if not isinstance(action, gymnasium.spaces.Box) or math.prod(action.shape) != 1:
         raise ValueError(f"gym:{identifier}: its action is {action}; it must be one number, r~")
@@ -133,10 +161,9 @@ def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[P
     if not 0 <= options.y_index < math.prod(observation.shape):
         last = math.prod(observation.shape) - 1
         raise ValueError(f"--y-index is {options.y_index}; gym:{identifier} observes numbers 0 to {last}")
-    dt = getattr(first.unwrapped, "dt", None)
     declared = options.declared(
-        r_tilde_bounds=(float(action.low.item()), float(action.high.item())),
-        control_step=float(dt) if isinstance(dt, int | float) else 1.0,
+        r_tilde_bounds=(declaration.number(action.low.ravel()[0]), declaration.number(action.high.ravel()[0])),
+        control_step=dt or 1.0,
         episode_steps=limit or EPISODE,
         y_unit="1",
     )
@@ -145,52 +172,17 @@ def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[P
     def simulator() -> _Gym:
         return _Gym(free.pop() if free else make(), options.y_index)
 
-    return host.plant(simulator, name=name, time_unit="step" if dt is None else "s", **declared)
+    return _plant(simulator, name, "step" if dt is None else "s", declared)
 
 
-class _Fmu:
-    """An FMU for co-simulation between two of its variables; nan where a step failed."""
-
-    def __init__(self, description: Any, folder: str, given: str, seen: str, control_step: float) -> None:
-        from fmpy import instantiate_fmu
-
-        references = {variable.name: variable.valueReference for variable in description.modelVariables}
-        self._input, self._output, self._control_step = [references[given]], [references[seen]], control_step
-        self._fmu: Any = instantiate_fmu(folder, description, "CoSimulation")
-        self._three = description.fmiVersion.startswith("3")
-        self._begun = False
-        self._time = math.nan
-
-    def reset(self, seed: int) -> float:
-        del seed  # an FMU draws nothing
-        if self._begun:
-            self._fmu.reset()
-        self._begun, self._time = True, 0.0
-        if self._three:
-            self._fmu.enterInitializationMode(startTime=0.0)
-        else:
-            self._fmu.setupExperiment(startTime=0.0)
-            self._fmu.enterInitializationMode()
-        self._fmu.exitInitializationMode()
-        return self._y()
-
-    def step(self, r_tilde: float) -> float:
-        from fmpy.fmi1 import FMICallException
-
-        try:
-            (self._fmu.setFloat64 if self._three else self._fmu.setReal)(self._input, [r_tilde])
-            done = self._fmu.doStep(self._time, self._control_step)
-        except FMICallException:
-            return math.nan
-        self._time += self._control_step
-        wants_to_end = self._three and done[1]
-        return math.nan if wants_to_end else self._y()
-
-    def _y(self) -> float:
-        return float((self._fmu.getFloat64 if self._three else self._fmu.getReal)(self._output)[0])
+def _plant(
+    make: Callable[[], host.Simulator], name: str, time_unit: str, declared: dict[str, Any], **rest: Any
+) -> tuple[Plant, tuple[()]]:
+    """The plant of such simulators: no episode is longer than one of the training, as they may end after it."""
+    return host.plant(make, name=name, time_unit=time_unit, family_steps=declared["episode_steps"], **declared, **rest)
 
 
-def _said(variable: Any, attribute: str) -> str | None:
+def _attribute(variable: Any, attribute: str) -> str | None:
     """An attribute of an FMU's variable, which may stand in its declared type."""
     own = getattr(variable, attribute)
     return getattr(variable.declaredType, attribute, None) if own is None else own
@@ -200,49 +192,194 @@ def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[
     """The plant in an FMU for co-simulation (FMI 2 or 3), from one of its inputs to one of its outputs.
 
     Raises:
-        ValueError: FMPy is not there, the file is no such FMU, or it has other variables.
+        ValueError: FMPy is not there, the file is no such FMU, it has other variables, or it fails at once.
     """
+    description, folder = _extracted(path, options.validate)
+    given, seen = (_variable(description, causality, getattr(options, causality), path) for causality in _CAUSALITIES)
+    try:
+        experiment = _Experiment.of(description)
+        bounds = tuple(float(_attribute(given, end) or math.nan) for end in ("min", "max"))
+    except ValueError as error:
+        raise ValueError(f"{path} says what is no number: {error}") from None
+    asked = experiment.step or 1.0 if options.control_step is None else options.control_step
+    control_step = experiment.check(declaration.checked(declaration.POSITIVE, "--control-step", asked))
+    declared = options.declared(
+        r_tilde_bounds=bounds,
+        control_step=control_step,
+        episode_steps=min(EPISODE, experiment.most(control_step) or EPISODE),
+        y_unit=_attribute(seen, "unit") or "1",
+    )
+    setup = Setup(folder, given.name, seen.name, experiment.start, control_step)
+    once = str(description.coSimulation.canBeInstantiatedOnlyOncePerProcess).lower() in ("true", "1")
+    try:
+        make, first = _started(name, setup, once, experiment.step, declared["setpoint_range"][1])
+        _check_whole(first, declared, experiment)
+    except FmuError as error:
+        raise ValueError(f"{path} {error}") from error
+    free = [first]
+
+    def simulator() -> Instance | Apart:
+        return free.pop() if free else make()
+
+    most = APART if isinstance(first, Apart) else host.SIMULATORS
+    return _plant(simulator, name, "s", declared, side_by_side=most)
+
+
+_CAUSALITIES = ("input", "output")
+
+
+def _extracted(path: str, validate: bool) -> tuple[Any, str]:
+    """Description of an FMU, and the folder to which it was extracted, until this process ends."""
     try:
         import fmpy
+        from fmpy.model_description import ValidationError
     except ImportError:
         raise ValueError('a plant fmu:FILE needs FMPy: pip install "jaxouter[fmu]"') from None
     try:
-        description = fmpy.read_model_description(path)
         folder = str(fmpy.extract(path))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        description = fmpy.read_model_description(folder, validate=validate)
+    except ValidationError as error:
+        raise ValueError(f"{path}: {error}\nMend it, or take it as it is by --no-validate") from None
     except Exception as error:  # whatever a file that is none makes FMPy raise
-        raise ValueError(f"{path} is not a readable FMU: {str(error).partition(chr(10))[0]}") from None
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        raise ValueError(f"{path} is not a readable FMU: {said(error)}") from None
     if description.coSimulation is None or not str(description.fmiVersion).startswith(("2", "3")):
         raise ValueError(f"{path} is FMI {description.fmiVersion}; it must be FMI 2 or 3, for co-simulation")
-    variables = {}
-    for causality in ("input", "output"):
-        known = {
-            variable.name: variable
-            for variable in description.modelVariables
-            if variable.causality == causality and variable.type in ("Real", "Float64") and not variable.dimensions
-        }
-        asked = getattr(options, causality)
-        if asked not in known and (asked is not None or len(known) != 1):
-            raise ValueError(f"--{causality} is {asked}; {path} has: {', '.join(known) or 'none'}")
-        variables[causality] = known[asked or next(iter(known))]
-    low, high = (float(_said(variables["input"], end) or math.nan) for end in ("min", "max"))
-    experiment = description.defaultExperiment
-    step_size = None if experiment is None or experiment.stepSize is None else float(experiment.stepSize)
-    unit = _said(variables["output"], "unit") or "1"
-    declared = options.declared(
-        r_tilde_bounds=(low, high), control_step=step_size or 1.0, episode_steps=EPISODE, y_unit=unit
-    )
-    names = variables["input"].name, variables["output"].name
+    return description, folder
 
-    def make() -> _Fmu:
-        return _Fmu(description, folder, *names, declared["control_step"])
 
+def _variable(description: Any, causality: str, asked: str | None, path: str) -> Any:
+    """The variable that is asked for, or the only one of its causality."""
+    known = {
+        variable.name: variable
+        for variable in description.modelVariables
+        if variable.causality == causality and variable.type in ("Real", "Float64") and not variable.dimensions
+    }
+    if asked not in known and (asked is not None or len(known) != 1):
+        raise ValueError(f"--{causality} is {asked}; {path} has: {', '.join(known) or 'none'}")
+    return known[asked or next(iter(known))]
+
+
+class _Experiment(NamedTuple):
+    """What an FMU says of its time, s; None: nothing."""
+
+    start: float
+    stop: float | None
+    step: float | None
+    fixed: float | None  # of which a communication step must be a multiple
+
+    @classmethod
+    def of(cls, description: Any) -> _Experiment:
+        said, interface = description.defaultExperiment, description.coSimulation
+        pairs = (said, "startTime"), (said, "stopTime"), (said, "stepSize"), (interface, "fixedInternalStepSize")
+        values = [getattr(where, name, None) for where, name in pairs]
+        start, stop, step, fixed = (None if value is None else float(value) for value in values)
+        return cls(start or 0.0, stop, step or fixed, fixed)
+
+    def most(self, control_step: float) -> int | None:
+        """Control steps until its stop time."""
+        return None if self.stop is None else max(1, math.floor((self.stop - self.start) / control_step + ROUNDING))
+
+    def check(self, control_step: float) -> float:
+        """The control step; raises ValueError where it is no multiple of a fixed one."""
+        if self.fixed is not None:
+            times = control_step / self.fixed
+            if round(times) < 1 or abs(times - round(times)) > ROUNDING * times:
+                raise ValueError(
+                    f"--control-step is {control_step:g}; it must be a multiple of the FMU's fixed internal step size, "
+                    f"{self.fixed:g} s"
+                )
+        return control_step
+
+
+def _started(
+    name: str, setup: Setup, once: bool, own_step: float | None, r_tilde: float
+) -> tuple[Callable[[], Any], Instance | Apart]:
+    """How instances of an FMU are made, and the first; whether it can be reset, and made twice, is found by trying.
+
+    Args:
+        name: of the plant.
+        setup: how it is run.
+        once: whether it says itself that a process may have one instance.
+        own_step: the step size that it says, s.
+        r_tilde: for the steps of this trial.
+
+    Raises:
+        FmuError: it can't be started, or refuses the control step.
+    """
+    kind: type[Instance | Apart] = Apart if once else Instance
+    first = kind(setup)
+    trouble = _trouble_with_reset(first, setup, own_step, r_tilde)
+    if trouble is not None:
+        first.free()
+        setup = setup._replace(anew=True)
+        first = kind(setup)
+    if not once:
+        second = kind(setup)
+        try:
+            for instance in (first, second, first):
+                instance.reset(0)
+                instance.step(r_tilde)
+        except FmuError:
+            kind = Apart
+            first.free()
+            first = kind(setup)
+        second.free()
+    first.reset(0)
+    first.step(r_tilde)
+    begun = time.perf_counter()
+    first.reset(0)
+    seconds = time.perf_counter() - begun
+    whys = ["can be instantiated once per process"] * (kind is Apart)
+    whys += [] if trouble is None else [f"can't be reset ({trouble})"]
+    if whys and multiprocessing.parent_process() is None:  # else it was said there
+        own = f"a process of its own, {APART} at a time" if kind is Apart else "an instance of its own"
+        warnings.warn(f"{name} {' and '.join(whys)}; each episode has {own}, begun in {seconds:.1g} s", stacklevel=2)
+    return partial(kind, setup), first
+
+
+def _trouble_with_reset(instance: Instance | Apart, setup: Setup, own_step: float | None, r_tilde: float) -> str | None:
+    """Why an FMU can't be reset; None: it can.
+
+    Raises:
+        FmuError: it can't be started, or refuses the control step.
+    """
+    differs = own_step is not None and abs(own_step - setup.step) > ROUNDING * setup.step
+    hint = f"; its own step size is {own_step:g} s, see --control-step" if differs else ""
     try:
-        free = [make()]
-    except Exception as error:  # whatever FMPy raises, as where there is no binary for this system
-        raise ValueError(f"{path} can't be started here: {error}") from None
+        y = [instance.reset(0)]
+    except FmuError as error:
+        raise FmuError(f"can't be started here: {error}") from error
+    try:
+        y.append(instance.step(r_tilde))
+    except FmuError as error:
+        raise FmuError(
+            f"failed in control step 1, of {setup.step:g} s, with r~ = {r_tilde:g}: {error}{hint}"
+        ) from error
+    try:
+        again = [instance.reset(0), instance.step(r_tilde)]
+    except FmuError as error:
+        return str(error)
+    return None if np.array_equal(y, again, equal_nan=True) else f"y begins with {again} after it, and with {y} before"
 
-    def simulator() -> _Fmu:
-        return free.pop() if free else make()
 
-    return host.plant(simulator, name=name, time_unit="s", **declared)
+def _check_whole(instance: Instance | Apart, declared: dict[str, Any], experiment: _Experiment) -> None:
+    """That an FMU goes on beyond its stop time, where the episode does.
+
+    Raises:
+        ValueError: it doesn't.
+    """
+    asked, most = declared["episode_steps"], experiment.most(declared["control_step"])
+    if most is None or asked <= most:
+        return
+    y, why = instance.reset(0), ""
+    for k in range(asked):
+        try:
+            y = instance.step(sum(declared["r_tilde_bounds"]) / 2)
+        except FmuError as error:
+            why = str(error)
+        if why or instance.ended or not math.isfinite(y):
+            raise ValueError(
+                f"--episode-steps is {asked}; the FMU's stop time is {experiment.stop:g} s, after {most} control steps "
+                f"of {declared['control_step']:g} s, and it goes no further than {k}: {why or instance.ended or y}"
+            )

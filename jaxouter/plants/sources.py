@@ -13,19 +13,24 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import inspect
+import logging
 import pkgutil
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, wraps
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from jaxouter import plants
-from jaxouter.plants import contract, simulators
-from jaxouter.plants.base import Plant
+from jaxouter.plants import contract, declaration, simulators
+from jaxouter.plants.base import Plant, float_leaves
+from jaxouter.plants.errors import PlantError, Raised, said
 from jaxouter.plants.simulators import PlantOptions
 
 GROUP = "jaxouter.plants"  # of entry points
@@ -62,8 +67,8 @@ def attribute(path: Path, name: str, what: str) -> Any:
     sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
-        raise ValueError(f"{path} can't be imported: {type(error).__name__}: {error}") from error
+    except Raised as error:
+        raise ValueError(f"{path} can't be imported: {said(error)}") from error
     if not hasattr(module, name):
         raise ValueError(f"{path} has no {name!r}")
     return getattr(module, name)
@@ -90,8 +95,8 @@ def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa:
             contract.shapes(plant, params)
         except ValueError as error:
             raise ValueError(f"{reference}: {error}") from error
-        except Exception as error:
-            raise ValueError(f"{reference} can't be made: {type(error).__name__}: {error}") from error
+        except Raised as error:
+            raise ValueError(f"{reference} can't be made: {said(error)}") from error
         plants.REGISTRY[name] = make
         SOURCES[name] = source
     return name
@@ -114,7 +119,10 @@ def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tup
     if not offered:
         known = dict.fromkeys([*plants.REGISTRY, *(point.name for point in entry_points(group=GROUP))])
         raise ValueError(f"there is no plant {reference!r}; the plants are: {', '.join(known)}, and {FORMS}")
-    make = offered[0].load()
+    try:
+        make = offered[0].load()
+    except Raised as error:
+        raise ValueError(f"{reference} can't be imported: {said(error)}") from error
     return reference, _named(reference, make), Path(inspect.getsourcefile(make) or "")
 
 
@@ -136,7 +144,7 @@ def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., t
 
     @cache
     def known(plant: Plant) -> Plant:
-        return replace(plant, name=name)
+        return _guarded(replace(plant, name=name))
 
     @cache
     def made() -> Any:
@@ -150,3 +158,69 @@ def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., t
         return found
 
     return named
+
+
+def _guarded(plant: Plant) -> Plant:
+    """The same plant, whose functions say by which of them an error was made."""
+    own = [name for name, kind in declaration.PLANT.items() if kind.function and callable(getattr(plant, name))]
+    if plant.variables is float_leaves:
+        own = [name for name in own if name not in ("variables", "settled")]
+
+    def guarded(name: str) -> Callable[..., Any]:
+        function = getattr(plant, name)
+
+        @wraps(function)
+        def call(*args: Any) -> Any:
+            try:
+                return function(*args)
+            except PlantError:
+                raise
+            except Raised as error:
+                raise PlantError(plant.name, f"in its function {name}", said(error)) from error
+
+        return call
+
+    return replace(plant, **{name: guarded(name) for name in own})
+
+
+class _Kept(logging.Filter):
+    """Keeps the last exception that JAX logs, and lets none be written."""
+
+    last: BaseException | None = None
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        self.last = error or self.last
+        return error is None
+
+
+CALLBACKS = ("jax._src.callback", "jax._src.debugging")
+"""Loggers to which JAX tells what a function raised that it called back."""
+
+
+@contextmanager
+def own_errors() -> Iterator[None]:
+    """What a plant's code raises where JAX calls it back comes out as it was raised, not in the wrappings of XLA.
+
+    Raises:
+        PlantError: it did.
+        KeyboardInterrupt: it was interrupted.
+    """
+    kept, loggers = _Kept(), [logging.getLogger(name) for name in CALLBACKS]
+    for logger in loggers:
+        logger.filters.insert(0, kept)  # before that of a block around this one
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises one or the other
+        last = kept.last
+        if isinstance(error, PlantError) or "callback" not in str(error):
+            raise
+        if isinstance(last, PlantError):
+            raise last from last.__cause__
+        if isinstance(last, KeyboardInterrupt):  # Ctrl-C while a plant was stepped
+            raise last from None
+        what = str(error).strip().splitlines()[-1] if last is None else said(last)
+        raise PlantError(", ".join(SOURCES), "in a function that JAX calls back", what) from error
+    finally:
+        for logger in loggers:
+            logger.removeFilter(kept)

@@ -13,6 +13,7 @@ import tyro
 from jaxouter import plants
 from jaxouter.agents.ddpg import DDPGConfig
 from jaxouter.loop.identify import LEVELS
+from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
 HUGE = 2**31  # no number of a configuration is as large
@@ -108,6 +109,10 @@ class TrainConfig:
     """The start."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     """The learner."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, declaration.plain(value))
 
     def check(self) -> TrainConfig:
         """Itself.

@@ -31,7 +31,9 @@ from jaxouter.training.pretraining import Rehearsal
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 FORMAT = 1
+RUNS = Path("runs")  # where a run goes that is told no other place
 KEEP = 2  # checkpoints of each seed
+SAVED = ("checkpoint-*.npz", "pretraining.npz")  # what a seed can go on from
 
 
 class RunWarning(UserWarning):
@@ -52,7 +54,7 @@ class Run:
         Raises:
             ValueError: `out` exists or can't be made.
         """
-        base = Path("runs") / f"{config.plant}-{config.preset}-{config.seed}"
+        base = RUNS / f"{config.plant}-{config.preset}-{config.seed}"
         candidates = (
             [out] if out is not None else [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))]
         )
@@ -120,6 +122,20 @@ class Run:
             yield
         finally:
             lock.release()
+
+    @contextmanager
+    def gone_if_nothing_is_learned(self) -> Iterator[None]:
+        """The folder, new, is removed where the block fails before anything was saved in it."""
+        try:
+            yield
+        except BaseException:
+            folders = list(map(self.seed_folder, self.seeds))
+            if not any(path for folder in folders for name in SAVED for path in folder.glob(name)):
+                shutil.rmtree(self.path, ignore_errors=True)
+                with suppress(OSError):  # other runs are in it
+                    if self.path.parent == RUNS:
+                        RUNS.rmdir()
+            raise
 
     def changes(self) -> list[str]:
         """What the results depend on and is no longer what it was when the run was made."""

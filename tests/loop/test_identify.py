@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -59,10 +61,26 @@ def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyP
     assert float(actor.act(params, (), r, r)[1]) == pytest.approx(26.0)
 
 
-@pytest.mark.parametrize("K", [0.0, float("nan")])
-def test_plant_that_does_not_answer_is_refused(K: float) -> None:
-    with pytest.raises(ValueError, match=r"DC gain of lag.*no r~ in \(-4.0, 4.0\)"):
-        identify.dc_gain(*lag.make(K=K), KEY)
+@pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        ({"K": 0.0}, "no r~ in (-4.0, 4.0) moves its output: y is the same under 8 levels of r~ from -3.5 to 3.5"),
+        ({"K": float("nan")}, "y is nan from control step 1 of 50 on under r~ = -3.5"),
+        ({"d": 8.0}, "y is the same under 8 levels of r~ from -3.5 to 3.5 for 80 control steps, its dead time, and"),
+        ({"K": 1e-4}, "all of r~, -4 to 4 1, moves y by 0.0007 1, and its set-points span 2 1: a gain so small"),
+    ],
+)
+def test_why_a_plant_does_not_answer_is_said(overrides: dict[str, float], text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"the DC gain of lag can't be found: {text}")):
+        identify.dc_gain(*lag.make(**overrides), KEY)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e5])
+def test_a_small_unit_is_no_small_gain(unit: float) -> None:
+    """Neither where y has it and r~ has not."""
+    plant, params = lag.make()
+    one = replace(plant, output=lambda params, state: unit * state.y, setpoint_range=(-unit, unit))
+    assert float(identify.dc_gain(one, params, KEY).gain) == pytest.approx(0.5 * unit, rel=1e-3)
 
 
 # The lag with K = 0.5, T = 0.3 s and a dead time of 2.5 steps of 0.1 s: two steps pass, then r~ jumps half way.

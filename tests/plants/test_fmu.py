@@ -1,5 +1,6 @@
 """FMUs as plants, FMI 2 and 3, from the file to a trained outer loop."""
 
+import re
 import shutil
 import subprocess
 import zipfile
@@ -7,9 +8,10 @@ from pathlib import Path
 from unittest.mock import patch
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from fmpy import platform_tuple, sharedLibraryExtension
+from fmpy import platform, platform_tuple, sharedLibraryExtension
 from fmpy.validation import validate_fmu
 
 from jaxouter import check, export, plants, train
@@ -42,20 +44,30 @@ def controller(tmp_path_factory):
     return folder / "outer.fmu"
 
 
+def compiled(folder, name, system, *defined, changes=()):
+    """An FMU of a C file beside this one, with the changes to its description."""
+    if shutil.which("gcc") is None:
+        pytest.skip("gcc is not installed")
+    folder.mkdir(exist_ok=True)
+    here, library = Path(__file__).parent, folder / f"lag{sharedLibraryExtension}"
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *(f"-D{each}" for each in defined)]
+    subprocess.run(["gcc", *flags, str(here / f"{name}.c"), "-o", str(library), "-lm"], check=True, timeout=60)
+    description = (here / f"{name}.xml").read_text()
+    for old, new in changes:
+        assert old in description
+        description = description.replace(old, new)
+    with zipfile.ZipFile(folder / "lag.fmu", "w") as file:
+        file.writestr("modelDescription.xml", description)
+        file.write(library, f"binaries/{system}/{library.name}")
+    return folder / "lag.fmu"
+
+
 @pytest.fixture(scope="module")
 def lag(tmp_path_factory):
     """FMI 3: a first-order lag with a dead time."""
-    if shutil.which("gcc") is None:
-        pytest.skip("gcc is not installed")
-    folder, here = tmp_path_factory.mktemp("compiled"), Path(__file__).parent
-    library = folder / f"lag{sharedLibraryExtension}"
-    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
-    subprocess.run(["gcc", *flags, str(here / "lag_fmi3.c"), "-o", str(library), "-lm"], check=True, timeout=60)
-    with zipfile.ZipFile(folder / "lag.fmu", "w") as file:
-        file.write(here / "lag_fmi3.xml", "modelDescription.xml")
-        file.write(library, f"binaries/{platform_tuple}/{library.name}")
-    assert validate_fmu(str(folder / "lag.fmu")) == []
-    return folder / "lag.fmu"
+    found = compiled(tmp_path_factory.mktemp("compiled"), "lag_fmi3", platform_tuple)
+    assert validate_fmu(str(found)) == []
+    return found
 
 
 def trained(arguments, name, capsys):
@@ -119,3 +131,82 @@ def test_an_fmu_of_fmi_3_is_trained_on_and_checked(lag, tmp_path, monkeypatch, c
     assert out.count("kept") == 5
     assert "2 control steps of 0.1 s" in out
     assert trained([f"fmu:{lag}", *FEW], "lag", capsys).plant == "lag"
+
+
+def faulty(folder, *defined, changes=()):
+    """Y' = r~ - y, FMI 2, steps of 0.1 s, stop time 10 s, with faults; see lag_fmi2.c."""
+    return compiled(folder, "lag_fmi2", platform, *defined, changes=changes)
+
+
+SHARE = np.exp(-0.1)  # of a difference that a control step leaves
+ONCE = [("<CoSimulation", '<CoSimulation canBeInstantiatedOnlyOncePerProcess="true"')]
+
+
+@pytest.mark.parametrize(
+    ("defined", "changes", "warning"),
+    [
+        ("RESET=1", [], r"can't be reset .*fmi2Reset failed with status 3 .error. - the FMU: no licence to reset"),
+        ("RESET=2", [], r"can't be reset .y begins with .* before.; each episode has an instance of its own"),
+        ("ONCE=1", [], "can be instantiated once per process; each episode has a process of its own"),
+        ("ONCE=2 RESET=1", ONCE, "once per process"),
+    ],
+)
+def test_what_can_be_made_once_or_not_be_reset_answers_all_the_same(tmp_path, defined, changes, warning):
+    """From its start again, from an older moment, and side by side."""
+    path = faulty(tmp_path, *defined.split(), changes=changes)
+    with pytest.warns(UserWarning, match=warning):
+        plant, params = plants.make(sources.add(f"fmu:{path}"))
+    begun = plant.init(jax.random.key(0), params)
+    after = [plant.step(params, begun, jnp.asarray(r_tilde), None) for r_tilde in (1.0, -2.0, 1.0)]
+    after = [plant.step(params, state, jnp.asarray(1.0), None).y for state in after]
+    np.testing.assert_allclose(after, [1.0 - SHARE**2, 1.0 - 3.0 * SHARE + 2.0 * SHARE**2, 1.0 - SHARE**2], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("defined", "changes", "options", "text"),
+    [
+        ("STEP=0.05", [], {}, "failed in control step 1, of 0.1 s, with r~ = 2: fmi2DoStep failed with status 2"),
+        ("STEP=0.1", [], {"control_step": 0.2}, "- the FMU: the step is another; its own step size is 0.1 s"),
+        (
+            "STOP=10",
+            [],
+            {"episode_steps": 150},
+            "--episode-steps is 150; the FMU's stop time is 10 s, after 100 control",
+        ),
+        (
+            "END=12",
+            [],
+            {"episode_steps": 150},
+            "goes no further than 120: the FMU ended the simulation in control step",
+        ),
+        ("CRASH=0", ONCE, {}, "the process of the FMU ended with status -6"),
+    ],
+)
+def test_what_an_fmu_refuses_is_said_before_anything_is_learned(tmp_path, defined, changes, options, text):
+    with pytest.raises(ValueError, match=re.escape(text)):
+        sources.add(f"fmu:{faulty(tmp_path, *defined.split(), changes=changes)}", PlantOptions(**options))
+
+
+def test_a_description_that_breaks_the_standard_is_told_whole_or_taken_as_it_is(tmp_path):
+    path = faulty(tmp_path, changes=[('<Real start="0" min', "<Real min"), ('causality="output"', 'causality="input"')])
+    with pytest.raises(ValueError, match="--no-validate") as error:
+        sources.add(f"fmu:{path}")
+    assert str(error.value).count("\n- ") == 2
+    with pytest.raises(ValueError, match="--output is None"):
+        sources.add(f"fmu:{path}", PlantOptions(input="r_tilde", validate=False))
+
+
+def test_a_control_step_is_a_multiple_of_a_fixed_step_size(tmp_path):
+    fixed = [
+        ('<DefaultExperiment stepSize="0.1"/>', ""),
+        ("<CoSimulation", '<CoSimulation fixedInternalStepSize="0.05"'),
+    ]
+    path = compiled(tmp_path, "lag_fmi3", platform_tuple, changes=fixed)
+    with pytest.raises(ValueError, match=r"--control-step is 0.12; .* multiple of the FMU's fixed .* 0.05 s"):
+        sources.add(f"fmu:{path}", PlantOptions(control_step=0.12))
+    assert plants.make(sources.add(f"fmu:{path}", PlantOptions(control_step=0.15)))[0].control_step == 0.15
+
+
+def test_an_episode_is_over_by_the_stop_time(tmp_path):
+    plant, _ = plants.make(sources.add(f"fmu:{faulty(tmp_path, 'STOP=10')}"))
+    assert (plant.episode_steps, plant.family_steps) == (100, 100)

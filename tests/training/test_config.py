@@ -1,6 +1,8 @@
 import json
 from dataclasses import replace
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxouter import plants
@@ -22,6 +24,18 @@ def test_paper_preset_is_the_papers(plant, steps):
     assert (config.steps, config.environments, config.updates, config.replay) == (steps, 1, 1, 1_000_000)
     assert (config.noise_theta, config.noise_sigma, config.residual, config.redraw) == (0.15, (0.2, 0.2), False, 0.0)
     assert config.total_updates == steps - config.prefill
+
+
+def test_numbers_of_numpy_are_numbers():
+    start = PretrainingConfig(gradient_steps=np.int32(3), noise=np.float32(0.1))
+    asked = dict(
+        seeds=np.int64(2), noise_sigma=[np.float32(0.1), jnp.asarray(0.2)], randomise=[["d1", np.float64(0), 1]]
+    )
+    config = replace(preset("pitch"), pretraining=start, **asked).check()
+    assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
+    assert (config.seeds, config.noise_sigma, config.pretraining.noise) == (2, (0.1, 0.2), 0.1)
+    with pytest.raises(ValueError, match="reward_scale is nan"):
+        replace(preset("pitch"), reward_scale=np.float32("nan")).check()
 
 
 @pytest.mark.parametrize(
