@@ -26,6 +26,7 @@ from jaxouter.plants.errors import Raised, said
 
 EPISODE = 200  # control steps, where nothing says how long
 APART = 16  # episodes under way of an FMU that takes a process for each
+NOTICED = 0.01  # s, from which on it is said how long an episode takes to begin
 ROUNDING = 1e-6  # control steps
 
 
@@ -334,7 +335,8 @@ def _started(
     whys += [] if trouble is None else [f"can't be reset ({trouble})"]
     if whys and multiprocessing.parent_process() is None:  # else it was said there
         own = f"a process of its own, {APART} at a time" if kind is Apart else "an instance of its own"
-        warnings.warn(f"{name} {' and '.join(whys)}; each episode has {own}, begun in {seconds:.1g} s", stacklevel=2)
+        slow = f", which takes {seconds:.1g} s to begin" if seconds > NOTICED else ""
+        warnings.warn(f"{name} {' and '.join(whys)}; each episode has {own}{slow}", stacklevel=2)
     return partial(kind, setup), first
 
 

@@ -16,6 +16,7 @@ from jaxouter.evaluation import board
 from jaxouter.evaluation.board import Contender, Job
 from jaxouter.plants import host, simulate, sources
 from jaxouter.plants.errors import PlantError, said
+from tests.precision import makes_nan
 
 DECLARED = dict(y_unit="1", time_unit="s", control_step=0.1, episode_steps=8, family_steps=8)
 DECLARED |= dict(r_tilde_bounds=(-2.0, 2.0), setpoint_range=(-0.5, 0.5))
@@ -200,6 +201,7 @@ def short(monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "Short-v0", spec)
 
 
+@makes_nan
 @pytest.mark.usefixtures("short")
 def test_an_environment_that_ends_is_named_with_the_step(capsys, tmp_path, monkeypatch):
     """Its `dt` is that of the plant, and its bounds have the digits that they show."""
