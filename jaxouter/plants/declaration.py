@@ -128,7 +128,7 @@ PLANT: Mapping[str, Kind] = {
     "rate_limit": _or_none(POSITIVE),
     "move_threshold": NOT_NEGATIVE,
     "error_scale": POSITIVE,
-    "history": COUNT,
+    "history": _or_none(COUNT),
     "families": Kind(f"a tuple of some of {', '.join(FAMILIES)}", _families),
     "family_steps": COUNT,
     "differentiable": FLAG,

@@ -47,7 +47,7 @@ def test_what_is_meant_is_taken(field, given, meant):
     assert hash(plant)
 
 
-NUMBERS = ("control_step", "output_limit", "rate_limit", "move_threshold")
+NUMBERS = ("control_step", "output_limit", "rate_limit", "move_threshold", "error_scale")
 COUNTS = ("episode_steps", "history", "family_steps")
 RANGES = ("r_tilde_bounds", "setpoint_range", "evaluation_range", "divergence_bounds")
 FUNCTIONS = ("init", "step", "output", "start", "draw", "members", "reuse", "variables", "settled", "noise_free")
@@ -55,7 +55,8 @@ REFUSED = [
     *((field, value) for field in NUMBERS for value in (-1.0, math.nan, "0.1", True, np.ones(1), 1j)),
     *((field, 0.0) for field in ("control_step", "output_limit", "rate_limit")),
     ("control_step", math.inf),
-    *((field, value) for field in COUNTS for value in (0, -3, 2.5, math.nan, math.inf, "9", None, [9])),
+    *((field, value) for field in COUNTS for value in (0, -3, 2.5, math.nan, math.inf, "9", [9])),
+    *((field, None) for field in ("episode_steps", "family_steps")),  # None of history: chosen
     *((field, value) for field in RANGES for value in ((1, -1), (2, 2), (0, math.inf), (math.nan, 1), (1,), 3, "ab")),
     *((field, value) for field in FUNCTIONS for value in (3.0, "step")),
     *((field, value) for field in ("init", "step", "output", "reuse") for value in (None,)),
