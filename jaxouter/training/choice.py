@@ -72,7 +72,7 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     if 2 * dead > plant.episode_steps:
         warned += (
             f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
-            f"moves y only in the rest; make episodes longer, {4 * dead} control steps or more",
+            f"moves y only in the rest; {_longer(4 * dead)}",
         )
     if config.pretraining.lags is None and start.lags == history:
         start = replace(start, lags=None)
@@ -80,7 +80,7 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     if plant.episode_steps < settling < np.inf:
         warned += (
             f"y takes about {settling:.0f} control steps to settle, longer than an episode of {plant.episode_steps}; "
-            f"make episodes longer, or the control step",
+            f"{_longer(2 * round(settling))}, or the control step longer",
         )
     told = [f"dead time {dead} control steps", f"order {order}"]
     told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
@@ -91,6 +91,11 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     said = f"identified: {', '.join(told)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
     known = replace(config, explored_steps=steps, pretraining=start)
     return Choice(known if given is not None else replace(known, history=history), said, (*warnings, *warned))
+
+
+def _longer(steps: int) -> str:
+    """What to do about an episode that is too short."""
+    return f"make episode_steps {steps} or more (--episode-steps for gym:, fmu: and log:)"
 
 
 def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
@@ -106,6 +111,6 @@ def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tup
         return replace(start, lags=lags, episode_steps=2 * lags), ()
     wrong = (
         f"the dead time of {dead} control steps does not fit in a model of half a recorded episode, {most} control "
-        f"steps; make episodes longer, {2 * lags} control steps or more"
+        f"steps; {_longer(2 * lags)}"
     )
     return replace(start, lags=min(lags, most)), (wrong,) if most <= dead else ()
