@@ -44,7 +44,13 @@ def choose(config: TrainConfig) -> Choice:
     key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
     found, steps = identify.explore(plant, params, key)
     if not any(one.shown for one in found):
-        identify.dc_gain(plant, params, key)  # which says so where nothing moves y at all
+        try:
+            identify.dc_gain(plant, params, key)
+        except ValueError as error:
+            late = (
+                f"within an episode of {plant.episode_steps} control steps; r~ does nothing, or its dead time is longer"
+            )
+            raise ValueError(f"{error} {late}") from None
         told = f"y of {plant.name} shows no effect of r~ beside its noise in {steps:,} control steps; history stays"
         return Choice(replace(config, explored_steps=steps), None, (f"{told} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
