@@ -31,6 +31,7 @@ HORIZON = 0.3  # of the predictions by which models are chosen, as share of an e
 SHOWN = 0.99  # of the prediction error without r~: with r~ it must be smaller, or y does not show it
 DRIFT = 0.08  # of the gain, by which it may still change in a fifth of an episode where y has settled
 NEGLIGIBLE = 0.01  # of the largest coefficient of r~; the first ones below are dead time
+GROWTH = 1.5  # of the swings of y from a fifth of an episode to the next, from which it runs away
 INTEGRATES = 0.05  # distance of a pole from 1, over one divided by the control steps in which nothing shows of it
 STEADY = (0.97, 1.05)  # ratio of the changes in two such fifths, where y grows as that of an integrator does
 ENOUGH = 20  # past samples in an observation, of a high order
@@ -122,8 +123,13 @@ def unsettled(levels: np.ndarray, y: np.ndarray) -> str | None:
     changes, lately = parts[:, 2] - parts[:, 1], 2.0 * (gains[2] - gains[3])  # of the last fifth, between its halves
     rest = changes - design @ np.linalg.lstsq(design, changes, rcond=None)[0]
     chance = math.sqrt(np.sum(rest**2) / (len(levels) - len(columns))) / float(np.linalg.norm(columns[0]))
+    swings = [float(y[:, y.shape[1] - (i + 1) * (steps // 5) :][:, : steps // 5].std(1).mean()) for i in (2, 1, 0)]
+    if swings[2] > GROWTH * swings[1] > GROWTH**2 * swings[0] and swings[2] > DRIFT * abs(gains[2]) * levels.std():
+        return "y runs away under a constant r~"
     if abs(last) <= max(DRIFT * abs(gains[2]), 3.0 * chance) or abs(lately) <= DRIFT / 4.0 * abs(gains[2]):
         return None
+    if before * last < 0.0:
+        return None  # y swings about where it stays
     ratio = last / before if before else math.inf
     if ratio > STEADY[1]:
         return "y runs away under a constant r~"

@@ -44,7 +44,13 @@ def choose(config: TrainConfig) -> Choice:
     key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
     found, steps = identify.explore(plant, params, key)
     if not any(one.shown for one in found):
-        identify.dc_gain(plant, params, key)  # which says so where nothing moves y at all
+        try:
+            identify.dc_gain(plant, params, key)
+        except ValueError as error:
+            late = (
+                f"within an episode of {plant.episode_steps} control steps; r~ does nothing, or its dead time is longer"
+            )
+            raise ValueError(f"{error} {late}") from None
         told = f"y of {plant.name} shows no effect of r~ beside its noise in {steps:,} control steps; history stays"
         return Choice(replace(config, explored_steps=steps), None, (f"{told} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
@@ -72,7 +78,7 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     if 2 * dead > plant.episode_steps:
         warned += (
             f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
-            f"moves y only in the rest; make episodes longer, {4 * dead} control steps or more",
+            f"moves y only in the rest; {_longer(4 * dead)}",
         )
     if config.pretraining.lags is None and start.lags == history:
         start = replace(start, lags=None)
@@ -80,7 +86,7 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     if plant.episode_steps < settling < np.inf:
         warned += (
             f"y takes about {settling:.0f} control steps to settle, longer than an episode of {plant.episode_steps}; "
-            f"make episodes longer, or the control step",
+            f"{_longer(2 * round(settling))}, or the control step longer",
         )
     told = [f"dead time {dead} control steps", f"order {order}"]
     told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
@@ -91,6 +97,11 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
     said = f"identified: {', '.join(told)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
     known = replace(config, explored_steps=steps, pretraining=start)
     return Choice(known if given is not None else replace(known, history=history), said, (*warnings, *warned))
+
+
+def _longer(steps: int) -> str:
+    """What to do about an episode that is too short."""
+    return f"make episode_steps {steps} or more (--episode-steps for gym:, fmu: and log:)"
 
 
 def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
@@ -106,6 +117,6 @@ def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tup
         return replace(start, lags=lags, episode_steps=2 * lags), ()
     wrong = (
         f"the dead time of {dead} control steps does not fit in a model of half a recorded episode, {most} control "
-        f"steps; make episodes longer, {2 * lags} control steps or more"
+        f"steps; {_longer(2 * lags)}"
     )
     return replace(start, lags=min(lags, most)), (wrong,) if most <= dead else ()

@@ -115,6 +115,8 @@ T = np.arange(201.0)
         (1 - np.exp(-T / 200), "does not settle"),
         (0.04 * T, "keeps growing"),
         (np.exp(T / 40) - 1, "runs away"),
+        (1 - np.cos(T / 10) * np.exp(T / 40), "runs away"),
+        (1 + 0.3 * np.cos(T / 15), None),  # it swings about where it stays
     ],
 )
 def test_a_gain_that_still_changes_is_none(response: np.ndarray, words: str | None, noise: float) -> None:
