@@ -26,6 +26,7 @@ from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rivals import SIMPLE
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
+from jaxouter.plants import Plant
 from jaxouter.plants.errors import PlantError
 from jaxouter.plants.sources import add, own_errors
 from jaxouter.progress import Progress, clock
@@ -200,7 +201,7 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
         traces = rollout(trainer.policy, trainer.policy_params(state), watched(), record_members=True)
         return {"mae": mae(traces)}
 
-    shown = Learning(progress, config, first, flop)
+    shown = Learning(progress, config, plants.make(config.plant)[0], first, flop)
     stopping = cli.Interrupt("what runs now ends, then everything is saved")
     with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
@@ -219,10 +220,11 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
 class Learning:
     """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
 
-    def __init__(self, progress: Progress, config: TrainConfig, watched: str, flop: tuple[float, float]) -> None:
+    def __init__(
+        self, progress: Progress, config: TrainConfig, plant: Plant, watched: str, flop: tuple[float, float]
+    ) -> None:
         """Args: watched: id of what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
-        self._progress, self._config, self._watched = progress, config, watched
-        self._plant = plants.make(config.plant)[0]
+        self._progress, self._config, self._plant, self._watched = progress, config, plant, watched
         start, updates = config.pretraining.gradient_steps, config.total_updates
         self._gradient_steps, self._weights = config.seeds * (start + updates), flop
         self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))

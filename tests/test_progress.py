@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import pytest
 from rich.console import Console
@@ -15,7 +14,7 @@ from rich.console import Console
 from jaxouter import cli, compare, evaluate, progress, train
 from jaxouter.evaluation import evaluate as evaluation
 from jaxouter.evaluation import scenarios
-from jaxouter.plants import REGISTRY, Plant, host
+from jaxouter.plants import REGISTRY, host
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset
 from tests import lag
@@ -212,16 +211,9 @@ class Heard:
         self.done, self.best = done, best
 
 
-class Watched(NamedTuple):
-    """A scenario, as far as it is looked at."""
-
-    plant: Plant
-    id: str = "lag/steps"
-
-
 def begun(clock, config, plant, flop=(10.0, 1.0)):
     of = Progress(Console(file=io.StringIO(), force_terminal=True, width=80), clock=clock)
-    return of, train.Learning(of, config, Watched(plant), flop)
+    return of, train.Learning(of, config, plant, "lag/steps", flop)
 
 
 def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):

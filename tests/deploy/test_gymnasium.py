@@ -122,7 +122,7 @@ def test_divergence_terminates_within_the_space() -> None:
     assert len(seen) < 1 + 50
     assert seen[-1][2:4] == (True, False)
     assert seen[-1][4]["y"] == 20.0
-    assert seen[-1][1] < -50.0
+    assert seen[-1][1] < -5.0
     assert all(obs in env.observation_space for obs, *_ in seen)
 
 

@@ -157,7 +157,7 @@ def test_divergence_terminates_with_its_penalty() -> None:
         assert not bool(truncated)
         y = min(true_y, 20.0)
         assert float(state.y) == pytest.approx(y, rel=1e-4)
-        assert float(reward) == pytest.approx(-0.3 * abs(r - y) - 50.0 * ended[-1], rel=1e-4)
+        assert float(reward) == pytest.approx(-0.3 * abs(r - y) - 5.0 * ended[-1], rel=1e-4)
     assert ended == [False, True, True, True]
 
 
@@ -181,7 +181,7 @@ def test_output_that_is_not_finite_terminates_and_counts_as_a_bound(y: float, co
     assert not bool(truncated)
     chex.assert_tree_all_finite((obs, reward, info))
     assert float(after.y) == float(info["y"]) == counted_as
-    assert float(reward) == pytest.approx(-0.3 * abs(0.5 - counted_as) - 50.0)
+    assert float(reward) == pytest.approx(-0.3 * abs(0.5 - counted_as) - 5.0)
 
 
 def test_plant_that_breaks_is_replaced_by_a_new_episode() -> None:
