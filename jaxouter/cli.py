@@ -216,6 +216,7 @@ def print_lists() -> None:
 
 def progress(shown: bool = True) -> Progress:
     """Progress on the console of the commands; not shown in processes but the first."""
+    jax.devices()  # what is not there is said before anything else, see `missing_backend`
     return Progress(console, shown)
 
 

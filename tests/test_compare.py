@@ -16,7 +16,7 @@ import matplotlib
 import pytest
 import tyro
 
-from jaxouter import compare, evaluate
+from jaxouter import cli, compare, evaluate
 from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.rivals import NAMES
 from jaxouter.plants import REGISTRY
@@ -193,7 +193,7 @@ def test_where_nothing_can_be_drawn_all_else_is_written(compared, tmp_path, caps
         raise RuntimeError("no fonts")
 
     monkeypatch.setattr(compare.comparison, "draw", draw)
-    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), compared.content, [])
+    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), compared.content, [], cli.progress())
     assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
     assert "outer loops compared" in page.read_text(encoding="utf-8")
     assert json.loads((tmp_path / "comparison.json").read_text()) == compared.content

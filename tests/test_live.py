@@ -39,6 +39,7 @@ def begun(tmp_path_factory):
     return out, folder / "loop"
 
 
+@pytest.mark.slow
 def test_it_begins_from_nothing_in_real_time(begun):
     out, folder = begun
     for text in ("step 0: recording", ": static", "missed deadlines", "us (p99)", "had r passed"):
@@ -57,6 +58,7 @@ def test_it_begins_from_nothing_in_real_time(begun):
     assert Law.load(folder / "live" / "controller.npz").control_step == 0.02
 
 
+@pytest.mark.slow
 def test_the_rows_are_a_log_where_no_deadline_was_missed(begun):
     path = begun[1] / "live" / "steps.csv"
     lines = path.read_text().splitlines()
@@ -67,6 +69,7 @@ def test_the_rows_are_a_log_where_no_deadline_was_missed(begun):
         assert read(path).step == pytest.approx(0.02)
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_and_ends_by_ctrl_c(begun, tmp_path):
     folder = begun[1]
     process = start(EXAMPLE, "--run", str(folder), "--dt", "0.02", "--reference", "4", cwd=tmp_path)

@@ -37,6 +37,7 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
         Run.open(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_log_is_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "lag.csv", recorded(*lag.make(), rows=600, noise=0.03))

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxouter import compare, evaluate, plants, train
+from jaxouter import cli, compare, evaluate, plants, train
 from jaxouter.evaluation import pace, scenarios
 from jaxouter.evaluation.evaluate import evaluate as evaluated
 from jaxouter.evaluation.evaluate import rival
@@ -130,7 +130,7 @@ def test_after_the_training_of_a_slow_plant_there_are_few_episodes(capsys, tmp_p
     for seconds, asked, episodes in ((4.5, None, 4), (4.5, 2, 2)):
         rows = [{"seconds": 3 * 3 * 20 * 7e-3 * seconds}]  # of three policies on three scenarios
         monkeypatch.setattr(Run, "rows", lambda run, seed, rows=rows: rows)
-        train.report(run, finals, 0.0, asked)
+        train.report(run, finals, 0.0, cli.progress(), asked)
         text = "evaluation: 3 scenarios of 4 episodes: about 5 s, at 7 ms a control step, as long as learning took"
         assert (text in capsys.readouterr().out) == (episodes == 4)
         assert set(json.loads((run.path / "summary.json").read_text())["episodes"].values()) == {episodes}

@@ -126,7 +126,8 @@ def test_a_plant_that_fails_in_a_comparison_is_named(capsys):
 def test_a_plant_that_fails_after_learning_leaves_what_was_learned(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plants.REGISTRY["mine"] = lambda: MINE
-    monkeypatch.setattr(train, "learn", lambda run, options: {0: None})
+    monkeypatch.setattr(train, "chosen", lambda config: config)  # which would step it first
+    monkeypatch.setattr(train, "learn", lambda *_: {0: None})
     monkeypatch.setattr(train, "report", lambda *_: simulate(*MINE, jnp.ones(8), jax.random.key(0)))
     with pytest.raises(SystemExit) as end:
         train.main(["mine", "--out", "run", "--history", "2"])

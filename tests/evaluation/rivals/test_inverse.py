@@ -20,6 +20,7 @@ BUDGET = 20_000
 def tuned():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inverse, "UPDATES", 1_000)
+        patch.setattr(inverse, "BATCH", 64)
         return inverse.tune(*lag.make(), KEY, BUDGET, lambda text, share: None)
 
 

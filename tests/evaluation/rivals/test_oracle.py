@@ -17,7 +17,7 @@ from tests import lag
 from tests.training.small import small as small_run
 
 KEY = jax.random.key(0)
-SMALL = {"SEEDS": 1, "BATCH": 16, "FIRST_STAGE": 150, "STAGES": 2, "VALIDATION": 64}
+SMALL = {"SEEDS": 1, "BATCH": 16, "FIRST_STAGE": 100, "STAGES": 2, "VALIDATION": 64}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -65,8 +65,8 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
 
 
 def test_steps_and_stages_are_counted(tuned):
-    assert tuned.settings["gradient_steps"] == 300
-    assert tuned.steps == (300 * 16 + identify.LEVELS) * 50
+    assert tuned.settings["gradient_steps"] == 200
+    assert tuned.steps == (200 * 16 + identify.LEVELS) * 50
     first, second = (max(values) for values in tuned.settings["returns"])
     assert second > 1.1 * first  # returns are negative
 

@@ -94,7 +94,7 @@ def test_it_finds_the_reciprocal_of_the_gain_for_its_prefilter(tuned):
 @pytest.mark.parametrize("plant", [kinds.Integrating, kinds.Slow])
 def test_where_y_does_not_settle_it_acts_from_where_y_stays(plant):
     made = plant()
-    found = pi.tune(*made, KEY, 40_000, lambda text: None)
+    found = pi.tune(*made, KEY, 40_000, lambda text, share: None)
     assert found.settings["slope"] == 0.0
     episodes = training_episodes(*made, jax.random.split(KEY)[1])
     assert score(*pi.build(made[0], found), episodes) > 0.7 * score(*none(made[0]), episodes)  # both negative
