@@ -168,6 +168,7 @@ def test_mistakes_are_one_line_and_status_2_and_nothing_is_written(arguments, te
     assert sorted(os.listdir()) == ["full"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -182,7 +183,7 @@ def test_another_declaration_than_that_of_the_folder_is_refused(begun, arguments
     assert text in capsys.readouterr().err
 
 
-def test_a_damaged_folder_is_said(begun, tmp_path, capsys):
+def test_a_damaged_folder_is_said(tmp_path, capsys):
     (tmp_path / "live").mkdir()
     (tmp_path / "live" / "config.json").write_text("{}")
     with pytest.raises(SystemExit) as end:

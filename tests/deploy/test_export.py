@@ -21,7 +21,8 @@ import onnx
 import onnxruntime
 import pytest
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import FMU2Slave, fmi2Error
+from fmpy.fmi2 import FMU2Slave, defaultCallbacks, fmi2Error
+from fmpy.logging import addLoggerProxy
 from fmpy.validation import validate_fmu
 
 from jaxouter import export, plants
@@ -483,6 +484,7 @@ def slave(pitch, tmp_path):
     instance = FMU2Slave(
         guid=said.guid, modelIdentifier=said.coSimulation.modelIdentifier, unzipDirectory=folder, instanceName="a"
     )
+    addLoggerProxy(ctypes.byref(defaultCallbacks))  # FMPy has one logger for the process, that of the newest instance
     instance.instantiate()
     instance.setupExperiment(startTime=0.0)
     instance.enterInitializationMode()
