@@ -21,8 +21,7 @@ import onnx
 import onnxruntime
 import pytest
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import FMU2Slave, defaultCallbacks, fmi2Error
-from fmpy.logging import addLoggerProxy
+from fmpy.fmi2 import fmi2Error
 from fmpy.validation import validate_fmu
 
 from jaxouter import export, plants
@@ -481,11 +480,8 @@ def slave(pitch, tmp_path):
     path = pitch.export("fmu", tmp_path / "controller.fmu")
     said = fmpy.read_model_description(str(path))
     folder = fmpy.extract(str(path), str(tmp_path / "fmu"))
-    instance = FMU2Slave(
-        guid=said.guid, modelIdentifier=said.coSimulation.modelIdentifier, unzipDirectory=folder, instanceName="a"
-    )
-    addLoggerProxy(ctypes.byref(defaultCallbacks))  # FMPy has one logger for the process, that of the newest instance
-    instance.instantiate()
+    # FMPy has one logger in a process, that of the newest instance which brings its own.
+    instance = fmpy.instantiate_fmu(folder, said, "CoSimulation", logger=lambda *message: print(message[-1].decode()))
     instance.setupExperiment(startTime=0.0)
     instance.enterInitializationMode()
     yield instance
