@@ -1,0 +1,148 @@
+"""Golden results: short trainings, exports and a comparison, as they were before the code was last restructured.
+
+    python scripts/golden.py            # compares with tests/golden.json; status 1 where something differs
+    python scripts/golden.py --write    # makes that file anew
+
+Every array is kept as its hash and a few of its elements. On the kind of machine and the version of jaxlib that wrote
+the file the hashes must agree, which is equality to the last bit; elsewhere the elements must, to a small tolerance.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import platform
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+# isort: off
+from jaxouter import compare, export, train  # before JAX, whose messages it sets
+
+# isort: on
+import jax
+import numpy as np
+import tyro
+
+from jaxouter.training.config import preset
+from jaxouter.training.run import Run
+from jaxouter.training.trainer import build
+
+FILE = Path(__file__).resolve().parent.parent / "tests" / "golden.json"
+ELEMENTS = 16  # of each array, evenly spaced
+TOLERANCE = 1e-3  # of the largest of them, on other machines
+PAPER = ["--preset", "paper", "--steps", "205", "--epoch", "5"]  # five updates
+DEFAULT = ["--pretraining.gradient-steps", "50"]
+TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--prefill", "640", "--epoch", "400"]
+TD3 += ["--environments", "8", "--redraw", "0.05", "--noise-end", "0.5", "--ddpg.n-step", "3"]
+TD3 += ["--ddpg.critics", "2", "--ddpg.policy-delay", "2", "--ddpg.target-noise", "0.2", "--ddpg.hidden", "32", "32"]
+
+
+def main(write: bool = False) -> None:
+    """Compare the results with those in the file, or write them to it."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        found = {"machine": machine(), "results": dict(sorted(results(Path(folder)).items()))}
+    if write:
+        FILE.write_text(json.dumps(found, indent=0) + "\n")
+        print(f"{len(found['results'])} results written to {FILE}")
+        return
+    wanted = json.loads(FILE.read_text())
+    exact = wanted["machine"] == found["machine"]
+    wrong = differences(wanted["results"], json.loads(json.dumps(found["results"])), exact)
+    print("\n".join(wrong) or f"{len(wanted['results'])} results agree, {'to the last bit' if exact else 'about'}")
+    if wrong:
+        raise SystemExit(1)
+
+
+def machine() -> dict[str, str]:
+    """What the last bits depend on."""
+    flags = ""
+    with contextlib.suppress(OSError):
+        flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
+    features = hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:16]
+    return {"processor": platform.machine(), "features": features, "jaxlib": version("jaxlib")}
+
+
+def results(folder: Path) -> dict[str, Any]:
+    """All results, by name."""
+    found: dict[str, Any] = {}
+    for plant in ("pitch", "heaters"):
+        for name, options in (("paper", PAPER), ("default", DEFAULT), ("td3", TD3)):
+            path = folder / f"{plant}-{name}"
+            train.main([plant, *options, "--out", str(path)])
+            found |= {f"{path.name}/{key}": value for key, value in trained(path).items()}
+    run = folder / "pitch-default"
+    for kind in ("npz", "c"):
+        export.main([str(run), "--format", kind, "--force"])
+    with np.load(run / "controller.npz") as file:
+        found |= {f"export/npz/{name}": array(file[name]) for name in file.files if name != "header"}
+    for suffix in ("c", "h"):
+        found[f"export/{suffix}"] = hashlib.sha256((run / f"controller.{suffix}").read_bytes()).hexdigest()
+    out = folder / "compare"
+    scenarios = ["pitch/paper", "pitch/delay-0.57", "pitch/noise", "pitch/load", "pitch/steps"]
+    policies = ["--run", str(run), "--policy", "static"]
+    compare.main(["pitch", *policies, "--scenario", *scenarios, "--sweep", "pitch/gain", "--out", str(out)])
+    found["compare"] = numbers(json.loads((out / "comparison.json").read_text()), ("rows", "sweeps", "certificate"))
+    return found
+
+
+def trained(path: Path) -> dict[str, Any]:
+    """Initial weights, all that a run has changed, and its figures of merit."""
+    run = Run.open(path)
+    state, _ = run.load(0)
+    trainer, params = build(preset(run.config.plant, run.config.preset))
+    fresh = trainer.fresh(jax.random.key(0), params).learner
+    summary = json.loads((path / "summary.json").read_text())
+    trees = {
+        "initial": (fresh.actor, fresh.critics),
+        "learner": (state.learner.actor, state.learner.critics, state.learner.target_actor),
+        "replay": state.replay.rows,
+        "loop": (state.env.r, state.env.y, state.obs, state.noise, jax.random.key_data(state.key)),
+        "base": tuple(state.prior),
+    }
+    rows = [{name: value for name, value in row.items() if "second" not in name} for row in run.rows(0)]
+    arrays = {f"{name}/{i}": array(x) for name, tree in trees.items() for i, x in enumerate(jax.tree.leaves(tree))}
+    return arrays | {"rows": rows, "summary": numbers(summary, ("results", "verdict"))}
+
+
+def array(x: Any) -> dict[str, Any]:
+    """Hash and some elements of an array."""
+    x = np.ascontiguousarray(x)
+    flat = x.ravel()[:: max(1, x.size // ELEMENTS)][:ELEMENTS]
+    digest = hashlib.sha256(f"{x.shape} {x.dtype}".encode() + x.tobytes()).hexdigest()
+    return {"sha256": digest, "elements": [float(value) for value in flat]}
+
+
+def numbers(content: Any, keys: tuple[str, ...]) -> Any:
+    """These keys of a JSON file, without what is a path or a time."""
+
+    def of(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: of(part) for key, part in value.items() if key not in ("run", "seconds", "text")}
+        return [of(part) for part in value] if isinstance(value, list) else value
+
+    return of({key: content[key] for key in keys if key in content})
+
+
+def differences(wanted: Any, found: Any, exact: bool, name: str = "") -> list[str]:
+    """What differs, by name."""
+    if isinstance(wanted, dict) and isinstance(found, dict) and set(wanted) == set(found):
+        if "elements" in wanted and not exact:
+            pair = np.array([wanted["elements"], found["elements"]])
+            close = np.abs(pair[0] - pair[1]).max(initial=0.0) <= TOLERANCE * np.abs(pair).max(initial=0.0)
+            return [] if close else [f"{name}: {found['elements']}, not {wanted['elements']}"]
+        return [text for key in wanted for text in differences(wanted[key], found[key], exact, f"{name}/{key}")]
+    if isinstance(wanted, list) and isinstance(found, list) and len(wanted) == len(found):
+        pairs = enumerate(zip(wanted, found, strict=True))
+        return [text for i, pair in pairs for text in differences(*pair, exact, f"{name}/{i}")]
+    numeric = isinstance(wanted, float) and isinstance(found, float)
+    if wanted == found or (not exact and numeric and abs(wanted - found) <= TOLERANCE * max(abs(wanted), 1.0)):
+        return []
+    return [f"{name}: {str(found)[:200]}, not {str(wanted)[:200]}"]
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
