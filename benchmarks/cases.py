@@ -19,18 +19,20 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxouter import plants
+from jaxouter.agents import OffPolicy
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
-from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
+from jaxouter.training.config import PretrainingConfig, TrainConfig, preset, with_options
 from jaxouter.training.devices import EIGEN, Fleet
-from jaxouter.training.plan import update_mflop
+from jaxouter.training.off_policy import OffPolicyDriver
+from jaxouter.training.resources import arithmetic
 from jaxouter.training.trainer import Trainer, TrainState, build
 
 SGEMM, NORMALS = "sgemm_gflops", "normals_per_s"
@@ -109,7 +111,7 @@ def numpy_hour(
         rng: of the noise.
         buffer: as x.
 
-    Source: paper section IV, spec section 3.
+    Source: paper section IV.
     """
     h = 1.0 / SUBSTEPS
     per_x = 1.0 - h / p.Ca * (p.Ua + p.Pi / (p.Ca * p.r_u))
@@ -235,10 +237,16 @@ def policy_roll_out(plant: str, environments: int) -> Job:
     learned = trainer.policy_params(trainer.fresh(jax.random.key(0), params))
 
     def act(learned: Any, key: jax.Array, obs: jax.Array, r: jax.Array) -> jax.Array:
-        action = trainer.learner.act(learned.actor, obs)[:, 0]
-        return jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(learned.prior, r, action)
+        action = jax.vmap(trainer.policy.action, (None, 0))(learned.actor, obs)
+        return jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(learned.base, r, action)
 
     return roll_out(trainer.env, params, environments, act, learned)
+
+
+def off_policy(trainer: Trainer) -> OffPolicyDriver:
+    """The driver of a learner from a replay."""
+    assert isinstance(trainer.driver, OffPolicyDriver)
+    return trainer.driver
 
 
 def training(
@@ -246,8 +254,9 @@ def training(
 ) -> tuple[Trainer, EnvParams, TrainConfig]:
     """The learner of a preset, not pretrained, with a replay of so many rows (None: its own), one seed a device."""
     base = preset(plant, name)
-    rows = rows or base.replay
-    config = replace(base, replay=rows, steps=2 * rows, prefill=FILLED, epoch=FILLED, seeds=devices, devices=devices)
+    rows = rows or cast(OffPolicy, base.agent.data).replay
+    options = {"agent.replay": rows, "agent.prefill": FILLED, "steps": 2 * rows, "epoch": FILLED}
+    config = with_options(base, options | {"seeds": devices, "devices": devices})
     config = replace(config, pretraining=PretrainingConfig())
     return *build(config), config
 
@@ -255,17 +264,22 @@ def training(
 def filled(trainer: Trainer, params: EnvParams) -> TrainState:
     """State with a full replay, so that a batch comes from all of it: what the prefill wrote, over and over."""
     state = trainer.prefill(trainer.start(0, params), params)
-    rows, first = state.replay.rows, trainer.replay.mirror
-    written = FILLED // trainer.replay.environments
+    rows, first = state.data.rows, off_policy(trainer).replay.mirror
+    written = FILLED // off_policy(trainer).replay.environments
     rows = rows[:, first + jnp.arange(rows.shape[1]) % written]
-    return state._replace(replay=state.replay._replace(rows=rows, written=jnp.asarray(trainer.replay.steps)))
+    return state._replace(replay=state.data._replace(rows=rows, written=jnp.asarray(off_policy(trainer).replay.steps)))
+
+
+def update_mflop(config: TrainConfig) -> int:
+    """FLOP of an update in millions, as the compiler counts them."""
+    return round(arithmetic(config)[1] / 1e6)
 
 
 def training_job(call: Callable[[], None], trainer: Trainer, config: TrainConfig, updates: int, fused: bool) -> Job:
-    extra: dict[str, float] = {"mflop": update_mflop(config.ddpg, trainer.learner.obs_size)}
+    extra: dict[str, float] = {"mflop": update_mflop(config)}
     if fused:
-        rows = trainer.replay.steps * trainer.replay.environments
-        extra |= {"updates_per_step": config.updates / config.environments, "replay": rows}
+        rows = off_policy(trainer).replay.steps * off_policy(trainer).replay.environments
+        extra |= {"updates_per_step": off_policy(trainer).data.updates / config.environments, "replay": rows}
     return Job(call, updates, "updates/s", SGEMM, extra)
 
 
@@ -273,13 +287,13 @@ def update(plant: str, name: str) -> Job:
     """Updates alone, all with one batch."""
     trainer, params, config = training(plant, name)
     state, updates = filled(trainer, params), 100
-    batch = trainer.batch(state.replay, jax.random.bits(state.key, (config.ddpg.batch_size, 2)))
+    batch = off_policy(trainer).batch(state.data, jax.random.bits(state.key, (off_policy(trainer).data.batch_size, 2)))
 
     def run(learner: Any, batch: Any) -> tuple[Any, Any]:
         keys = jax.random.split(jax.random.key(0), updates)
-        return jax.lax.scan(lambda learner, key: trainer.learner.update(learner, batch, key), learner, keys)
+        return jax.lax.scan(lambda learner, key: trainer.agent.update(learner, batch, key), learner, keys)
 
-    return training_job(repeated(run, state.learner, batch), trainer, config, updates, fused=False)
+    return training_job(repeated(run, state.agent, batch), trainer, config, updates, fused=False)
 
 
 def products(plant: str, name: str) -> Job:
@@ -288,7 +302,7 @@ def products(plant: str, name: str) -> Job:
     Five passes forward, the gradients of the weights of two networks, and of the inputs of their second layers.
     """
     trainer, _, config = training(plant, name)
-    batch, widths, updates = config.ddpg.batch_size, (trainer.learner.obs_size, *config.ddpg.hidden), 100
+    batch, widths, updates = off_policy(trainer).data.batch_size, (trainer.env.observer.size, *config.agent.hidden), 100
     normal = partial(jax.random.normal, jax.random.key(0))
     passes = [[normal((a, b)) * (i + 1.0) for a, b in pairwise(widths)] for i in range(5)]  # no two are the same
     rows = [normal((batch, width)) for width in widths]
@@ -321,7 +335,7 @@ def fused(plant: str, name: str, rows: int | None = None, devices: int = 1) -> J
         nonlocal states
         states, _ = jax.block_until_ready(fleet.epoch(states, params, steps))
 
-    return training_job(call, trainer, config, devices * 100 * config.updates, fused=True)
+    return training_job(call, trainer, config, devices * 100 * off_policy(trainer).data.updates, fused=True)
 
 
 def seeds_at_once(seeds: int) -> Job:
@@ -342,7 +356,8 @@ def first_epoch(config: TrainConfig) -> Callable[[], Any]:
     They, prefill and epoch are so few that nearly all of it is compilation.
     """
     start = replace(config.pretraining, gradient_steps=min(config.pretraining.gradient_steps, 5))
-    config = replace(config, prefill=max(config.ddpg.batch_size, 10 * config.environments), pretraining=start)
+    prefill = max(cast(OffPolicy, config.agent.data).batch_size, 10 * config.environments)
+    config = with_options(replace(config, pretraining=start), {"agent.prefill": prefill})
 
     def call() -> None:
         fleet = Fleet.of(config)

@@ -1,6 +1,6 @@
 """The comparison tables of the README, from comparison folders; what they show is kept in benchmarks/results.
 
-The last table answers the paper: each of its test cases, its figure, ours, the best rival and the limit.
+The last table answers the paper: each of its test cases, its figure, ours, the best baseline and the limit.
 
 python benchmarks/comparison.py runs/compare-pitch runs/compare-heaters
 """
@@ -24,10 +24,10 @@ RESULTS = Path(__file__).parent / "results"
 def claims(content: Mapping[str, Any]) -> Iterator[list[str]]:
     """A line for each scenario that stands in the paper."""
     lines = statistics.lines(content["rows"], content["policies"])
-    for name in scenarios.paper_scenarios(content["plant"]):
+    for name in scenarios.reported(content["plant"]):
         inner, drl = scenarios.get(name, 1).paper or (math.nan, math.nan)
         maes = {line.label: (line.median(name, "mae") or math.inf, line) for line in lines}
-        best = min((label for label in maes if maes[label][1].kind == "rival"), key=lambda label: maes[label][0])
+        best = min((label for label in maes if maes[label][1].kind == "baseline"), key=lambda label: maes[label][0])
         cells = [f"{drl:.2f} of {inner:.2f}"]
         cells += [f"{maes[label][0]:.3g} of {maes['none'][0]:.3g}" for label in ("learned", best, "oracle")]
         outside = ["" if maes[label][1].within_limits(name) else "!" for label in ("learned", best, "oracle")]
@@ -47,14 +47,14 @@ def main(folders: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         name = f"compare-{content['plant']}"
         shutil.copy(folder / "comparison.csv", RESULTS / f"{name}.csv")
         for figure in (folder / "figures").glob("*.png"):
-            if figure.stem in ("errors", "effort", "certificate") or figure.stem.startswith("sweep-"):
+            if figure.stem in ("errors", "effort", "stability") or figure.stem.startswith("sweep-"):
                 shutil.copy(figure, RESULTS / f"{name}-{figure.name}")
         columns, rows = statistics.table(content["rows"], content["policies"], "**{}**")
         print(f"\n{content['plant']}, MAE in {content['y_unit']}; {content['date']}, {content['seconds']:.0f} s\n")
         show(columns, rows)
         answers += claims(content)
     print("\nMAE, of that of the inner loop alone\n")
-    show(["test case", "the paper's DRL", "ours", "best rival", "limit", "that rival"], answers)
+    show(["test case", "the paper's DRL", "ours", "best baseline", "limit", "that baseline"], answers)
 
 
 if __name__ == "__main__":

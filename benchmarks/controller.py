@@ -1,4 +1,4 @@
-"""How long `jaxouter.deploy.Controller.step` takes, in microseconds: median, 99th percentile and greatest.
+"""How long `jaxouter.runtime.Controller.step` takes, in microseconds: median, 99th percentile and greatest.
 
 The weights are random, in the shapes of the presets; time does not depend on their values. JAX is in another process,
 so that the one that is timed has NumPy alone, as in a real loop. Samples have times, and the rate is limited.
@@ -24,15 +24,15 @@ from rich.console import Console
 from rich.table import Table
 from throughput import RESULTS, machine
 
-from jaxouter.deploy import Controller
-from jaxouter.deploy.law import Law
+from jaxouter.exports.spec import ControllerSpec
+from jaxouter.runtime import Controller
 
 CASES = (("pitch", "default"), ("heaters", "default"), ("pitch", "robust"))
 WARM_UP = 1000  # steps
 
 
-def random_law(plant: str, preset_name: str) -> Law:
-    """A law in the shapes of a preset."""
+def random_law(plant: str, preset_name: str) -> ControllerSpec:
+    """A spec in the shapes of a preset."""
     import jax
 
     from jaxouter.training.config import preset
@@ -42,28 +42,28 @@ def random_law(plant: str, preset_name: str) -> Law:
     shapes = trainer.policy_params(jax.eval_shape(trainer.fresh, jax.random.key(0), params))
     rng = np.random.default_rng(0)
     drawn = jax.tree.map(lambda leaf: rng.uniform(-0.1, 0.1, leaf.shape), shapes)
-    return Law.of(trainer.policy, drawn, trainer.env.plant)
+    return ControllerSpec.of(trainer.policy, drawn, trainer.env.plant)
 
 
-def durations(law: Law, steps: int) -> np.ndarray:
+def durations(spec: ControllerSpec, steps: int) -> np.ndarray:
     """Of each step, in microseconds; (steps,)."""
-    low, high = law.r_tilde_bounds
-    controller = Controller(law, rate_limit=(high - low) / 10)
-    r, y = np.random.default_rng(1).uniform(*law.setpoint_range, (2, WARM_UP + steps)).tolist()
+    low, high = spec.r_tilde_bounds
+    controller = Controller(spec, rate_limit=(high - low) / 10)
+    r, y = np.random.default_rng(1).uniform(*spec.setpoint_range, (2, WARM_UP + steps)).tolist()
     taken = []
     for k, (r_k, y_k) in enumerate(zip(r, y, strict=True)):
-        now = k * law.control_step
+        now = k * spec.control_step
         begin = time.perf_counter_ns()
         controller.step(r_k, y_k, now)
         taken.append(time.perf_counter_ns() - begin)
-    assert not any(controller.counts.values())  # it was the law all the time
+    assert not any(controller.counts.values())  # it was the spec all the time
     return np.array(taken[WARM_UP:]) / 1000
 
 
-def row(name: str, law: Law, steps: int) -> dict[str, Any]:
-    taken = durations(law, steps)
+def row(name: str, spec: ControllerSpec, steps: int) -> dict[str, Any]:
+    taken = durations(spec, steps)
     figures = {"median": np.median(taken), "p99": np.percentile(taken, 99), "max": taken.max()}
-    layers = [len(law.weights[0]), *map(len, law.biases)]
+    layers = [len(spec.weights[0]), *map(len, spec.biases)]
     return {"case": name, "layers": layers, "unit": "us"} | {key: round(float(us), 2) for key, us in figures.items()}
 
 
@@ -78,8 +78,8 @@ def main(steps: int = 100_000, json_file: Annotated[Path, tyro.conf.arg(name="js
         raise ValueError(f"--steps is {steps}; it must be at least 1")
     about = machine()
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        laws = list(pool.map(random_law, *zip(*CASES, strict=True)))
-    rows = [row("/".join(case), law, steps) for case, law in zip(CASES, laws, strict=True)]
+        specs = list(pool.map(random_law, *zip(*CASES, strict=True)))
+    rows = [row("/".join(case), spec, steps) for case, spec in zip(CASES, specs, strict=True)]
     json_file.write_text(json.dumps({"machine": about, "steps": steps, "rows": rows}, indent=2) + "\n")
     table = Table("case", "layers", "median", "p99", "max", title=f"microseconds a step; load {about['load_before']}")
     for each in rows:

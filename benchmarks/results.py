@@ -36,7 +36,7 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         if run.config.epochs:
             shutil.copy(run.figures / "learning-curve.png", RESULTS / f"{name}-learning.png")
         results = json.loads(content)["results"]
-        for scenario in scenarios.paper_scenarios(run.config.plant):
+        for scenario in scenarios.reported(run.config.plant):
             row = rows.setdefault(scenario, {})
             row["inner"], row["static"] = (f"{maes(results, p, scenario)[0]:.2f}" for p in ("none", "static"))
             paper = scenarios.get(scenario, 1).paper

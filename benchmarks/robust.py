@@ -1,4 +1,4 @@
-"""What a policy trained on many plants holds, beside the rivals, tuned on the nominal one, and beside its own limit.
+"""What a policy trained on many plants holds, beside the baselines, tuned on the nominal one, and beside its own limit.
 
 Each plant starts 64 times as in training and is then asked for the scenario's set-point, for 600 steps. It is held
 where |y| stays within its limit in all of the last 300. The limit is the oracle, retrained on the same drawn plants.
@@ -20,9 +20,9 @@ from comparison import show
 
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import Named, rival
+from jaxouter.evaluation.baselines import BASELINES, oracle
 from jaxouter.evaluation.metrics import held, mae
-from jaxouter.evaluation.rivals import RIVALS, oracle
+from jaxouter.evaluation.policies import Named, baseline
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.training.run import Run, surroundings, write_json
@@ -31,18 +31,18 @@ RESULTS = Path(__file__).parent / "results"
 LEARNED, LIMIT = "learned", "its limit"
 
 
-def contenders(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
+def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
     """Name and policies: one for each seed of the runs, and one of all others."""
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
     yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
     limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
     yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
-    for name in RIVALS:
-        yield name, [rival(name, run.config.plant)]
+    for name in BASELINES:
+        yield name, [baseline(name, run.config.plant)]
 
 
-def met(policies: Sequence[Named], scenario: Scenario) -> dict[str, Any]:
+def evaluated(policies: Sequence[Named], scenario: Scenario) -> dict[str, Any]:
     """MAE and the share that is held, each the median over the seeds, with the worst seed."""
     traces = [rollout(named.policy, named.params, scenario) for named in policies]
     with np.errstate(all="ignore"):
@@ -64,16 +64,16 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     cli.use_compilation_cache()
     opened = [Run.open(path) for path in runs]
     config, plant = opened[0].config, opened[0].config.plant
-    plants = [scenarios.perturbed(name) for name in scenarios.stability_scenarios(plant)]
+    plants = [scenarios.perturbed(name) for name in scenarios.for_stability(plant)]
     catalogue = [scenarios.get(name) for name in scenarios.catalogue(plant)]
     places = {s.id: scenarios.place(s, *opened[0].drawn) for s in catalogue}
     started: dict[str, Any] = {}  # rows by policy and scenario
     asked: dict[str, Any] = {}
-    for name, policies in contenders(opened):
+    for name, policies in entrants(opened):
         print(name, flush=True)
-        started[name] = {scenario.id: met(policies, scenario) for scenario in plants}
+        started[name] = {scenario.id: evaluated(policies, scenario) for scenario in plants}
         if name in (LEARNED, LIMIT):
-            asked[name] = {scenario.id: met(policies, scenario) for scenario in catalogue}
+            asked[name] = {scenario.id: evaluated(policies, scenario) for scenario in catalogue}
     about = {
         "date": date.today().isoformat(),
         "machine": surroundings(),

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.evaluate import evaluate, rival
+from jaxouter.evaluation.policies import baseline, evaluate
 from jaxouter.evaluation.statistics import interval
 from jaxouter.training.run import Run, surroundings, write_json
 
@@ -128,10 +128,10 @@ def main(
     cli.use_compilation_cache()
     table = []
     for plant in plants:
-        scenario = scenarios.get(scenarios.paper_scenarios(plant)[0])
+        scenario = scenarios.get(scenarios.reported(plant)[0])
         found = curves(plant, runs)
         static, limit = (
-            evaluate(rival(name, plant), [scenario])[scenario.id][1]["mae"] for name in ("static", "oracle")
+            evaluate(baseline(name, plant), [scenario])[scenario.id][1]["mae"] for name in ("static", "oracle")
         )
         levels = {"static": static, f"{NEAR:g} x the limit": NEAR * limit, "limit": limit}
         rows: dict[str, Any] = {}

@@ -16,10 +16,10 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures
-from jaxouter.loop import identify, log, trust
-from jaxouter.plants import Plant, contract, simulate
+from jaxouter.identification import identify, recorded_data, validation
+from jaxouter.plants import Plant, interface, simulate
+from jaxouter.plants.registry import add
 from jaxouter.plants.simulators import PlantOptions
-from jaxouter.plants.sources import add
 from jaxouter.training.choice import choose
 from jaxouter.training.config import preset
 
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         plant, params = plants.make(add(options.plant, options.plant_options))
         cli.use_compilation_cache()
         progress.phase("checking")
-        found = [("shapes and types", None), *contract.behaviour(plant, params)]
+        found = [("shapes and types", None), *interface.behaviour(plant, params)]
         cli.table(f"{plant.name}: the contract", ["what", "is"], [[what, wrong or "kept"] for what, wrong in found])
         if plant.identified:
             progress.phase("validating")
@@ -76,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def log_report(plant: Plant, path: str) -> Callable[[Path], Path]:
     """How far the log of this plant can be trusted; returns what draws it."""
-    told = trust.report(*log.identified(path))
-    rows = [list(row) for row in trust.table(told, plant.y_unit, plant.time_unit)]
+    told = validation.report(*recorded_data.identified(path))
+    rows = [list(row) for row in validation.table(told, plant.y_unit, plant.time_unit)]
     cli.table(f"{plant.name}: how far the log can be trusted", ["what", "is"], rows)
     for warning in told.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -25,15 +25,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jaxouter import plants
+from jaxouter import agents, plants, tasks
 from jaxouter.evaluation import cache, scenarios, sweeps
+from jaxouter.evaluation.baselines import NAMES
 from jaxouter.evaluation.metrics import significant
-from jaxouter.evaluation.rivals import NAMES
-from jaxouter.loop.identify import IdentificationWarning
-from jaxouter.plants.sources import FORMS, Source, add, own_errors
+from jaxouter.identification.identify import IdentificationWarning
+from jaxouter.plants.registry import FORMS, Registration, add, own_errors
 from jaxouter.progress import Progress
-from jaxouter.training.config import OWN, PRESETS
-from jaxouter.training.run import RunWarning
+from jaxouter.training.run import RunWarning, add_agent
 
 DEBUG = "--debug"
 NARROWEST = 20  # columns
@@ -192,11 +191,13 @@ def use_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
 
 
-def use_plants(sources: Iterable[Source]) -> None:
-    """What a process of its own begins with: the plants that its parent knows, and the compilation cache."""
+def use_own(registered: Iterable[Registration], own_agents: Iterable[str]) -> None:
+    """What a process of its own begins with: plants and agents that its parent knows, and the compilation cache."""
     last()
-    for source in sources:
-        add(source.reference, source.options)
+    for plant in registered:
+        add(plant.reference, plant.options)
+    for agent in own_agents:
+        add_agent(agent)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the parent has said what there is to say of the cache
         use_compilation_cache()
@@ -204,13 +205,14 @@ def use_plants(sources: Iterable[Source]) -> None:
 
 
 def print_lists() -> None:
-    """Plants, presets, scenarios, sweeps and policies."""
+    """Plants, presets, scenarios, sweeps, agents and policies."""
     for name in plants.REGISTRY:
         console.print(f"[bold]{name}[/bold]")
-        console.print("  presets:   " + ", ".join(PRESETS.get(name, OWN)))
+        console.print("  presets:   " + ", ".join(tasks.presets(name)))
         console.print("  scenarios: " + ", ".join(scenarios.catalogue(name)))
         console.print("  sweeps:    " + ", ".join(sweeps.catalogue(name)))
     console.print("plants of your own: " + FORMS)
+    console.print("agents: " + ", ".join(agents.AGENTS) + ", FILE.py:CLASS")
     console.print("policies: a run folder, " + ", ".join(NAMES))
 
 

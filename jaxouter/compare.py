@@ -1,4 +1,4 @@
-"""`python -m jaxouter.compare`: every policy beside its rivals and beside the limit, on every scenario."""
+"""`python -m jaxouter.compare`: every policy beside its baselines and beside the limit, on every scenario."""
 
 from __future__ import annotations
 
@@ -18,33 +18,35 @@ from typing import Annotated, Any
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import board, comparison, pace, report, scenarios, statistics, sweeps
-from jaxouter.evaluation.board import Contender, Done, Job
-from jaxouter.evaluation.rivals import BUDGET, SIMPLE
+from jaxouter.evaluation import comparison_figures, jobs, pace, report, scenarios, statistics, sweeps
+from jaxouter.evaluation.baselines import BUDGET, SIMPLE
+from jaxouter.evaluation.jobs import Done, Entrant, Job
 from jaxouter.plants import Plant, host
-from jaxouter.plants.sources import SOURCES
+from jaxouter.plants.registry import REGISTRATIONS
 from jaxouter.progress import Progress
-from jaxouter.training.run import add_plant, open_run, surroundings, write_json
+from jaxouter.training.run import add_agent, add_plant, open_run, own_agents, surroundings, write_json
 
 FORMAT = 1
-OVERALL = 3  # figures of all scenarios: errors, effort, certificate
+OVERALL = 3  # figures of all scenarios: errors, effort, stability
 
 
 @dataclass(frozen=True)
 class Options:
-    """Compare policies with their rivals, with the limit and with a lower bound, and write a report.
+    """Compare policies with their baselines, with the limit and with a lower bound, and write a report.
 
-    Rivals (none, static, pi, mpc, deepc, inverse) are identified and tuned on the training distribution of the plant,
-    through r~ and y alone; `oracle` is the limit for policies without preview, `clairvoyant` a lower bound with
-    preview. What concerns them is computed once and kept in the cache folder; the first time takes minutes.
+    Baselines (none, static, pi, mpc, deepc, inverse) are identified and tuned on the training distribution of the
+    plant, through r~ and y alone; `oracle` is the limit for policies without preview, `clairvoyant` a lower bound
+    with preview. Their results are computed once and kept in the cache folder; the first time takes minutes.
     """
 
     plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
     """pitch, heaters or your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; default: that of the runs, or pitch."""
+    agent: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE.py:CLASS ...", help_behavior_hint="")] = ()
+    """Agents of the runs, if your own."""
     run: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")] = ()
     """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()
-    """Rivals and limits to compare with; default: all; none always. FILE.py:CLASS is a policy of your own."""
+    """Baselines and limits to compare with; default: all; none always. FILE.py:CLASS is a policy of your own."""
     scenario: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...", help_behavior_hint="")] = ()
     """Scenarios, such as pitch/paper; default: all of the plant; see --list."""
     sweep: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")] = None
@@ -64,7 +66,7 @@ class Plan:
     """What the options mean."""
 
     plant: str
-    contenders: tuple[Contender, ...]
+    entrants: tuple[Entrant, ...]
     scenarios: tuple[str, ...]
     sweeps: tuple[str, ...]
     family_seed: int
@@ -109,6 +111,8 @@ def check(options: Options) -> Plan:
     Raises:
         ValueError: the options do not fit together, or name what does not exist.
     """
+    for reference in options.agent:
+        add_agent(reference)
     named_plant = None if options.plant is None else add_plant(options.plant, *options.run[:1] or (None,))
     runs = [open_run(path) for path in options.run]
     plant = named_plant or (runs[0][0].config.plant if runs else "pitch")
@@ -124,18 +128,18 @@ def check(options: Options) -> Plan:
         raise ValueError(f"the comparison is on {plant}; {foreign[0]} is another plant's")
     if not 0 <= options.family_seed < 2**32:
         raise ValueError(f"--family-seed is {options.family_seed}; it must lie in [0, 2^32)")
-    contenders = [
-        Contender("learned", "learned", str(run.path), seed)
+    entrants = [
+        Entrant("learned", "learned", str(run.path), seed)
         for run, median, chosen in runs
         for seed in (chosen if len(chosen) == 1 else sorted(chosen, key=lambda seed: seed != median))
     ]
-    contenders = list(dict.fromkeys([*contenders, *named(options.policy, plants.make(plant)[0])]))
-    for contender in contenders:
-        if contender.kind in ("learned", "user"):
-            board.load(contender, plant)  # what can't be loaded is said before minutes of tuning
+    entrants = list(dict.fromkeys([*entrants, *named(options.policy, plants.make(plant)[0])]))
+    for entrant in entrants:
+        if entrant.kind in ("learned", "user"):
+            jobs.load(entrant, plant)  # what can't be loaded is said before minutes of tuning
     return Plan(
         plant,
-        tuple(contenders),
+        tuple(entrants),
         tuple(dict.fromkeys(options.scenario or scenarios.catalogue(plant))),
         tuple(dict.fromkeys(sweeps.catalogue(plant) if options.sweep is None else options.sweep)),
         options.family_seed,
@@ -143,7 +147,7 @@ def check(options: Options) -> Plan:
     )
 
 
-def named(names: Sequence[str], plant: Plant) -> list[Contender]:
+def named(names: Sequence[str], plant: Plant) -> list[Entrant]:
     """The policies with these names, and a user's own; where no name is given, all that the plant allows.
 
     Raises:
@@ -151,14 +155,16 @@ def named(names: Sequence[str], plant: Plant) -> list[Contender]:
     """
     own, built_in = [], []
     for name in dict.fromkeys(names):
-        found = board.contender(name, plant)
-        if found.kind == "user":
-            same = any(found.name == other.name for other in own)  # of several files with this name
+        found = jobs.entrant(name, plant)
+        if jobs.is_own(name):
+            same = found.kind == "user" and any(
+                found.name == other.name for other in own
+            )  # of several files with this name
             own.append(found._replace(name=name) if same else found)
         else:
             built_in.append(name)
-    chosen = [name for name in board.possible(plant) if name == "none" or not built_in or name in built_in]
-    return own + [board.contender(name, plant) for name in chosen]
+    chosen = [name for name in jobs.possible(plant) if name == "none" or not built_in or name in built_in]
+    return own + [jobs.entrant(name, plant) for name in chosen]
 
 
 def folder(out: Path | None, plant: str) -> Path:
@@ -180,9 +186,9 @@ def told(plan: Plan) -> str | None:
     each = host.step_seconds(plants.make(plan.plant)[0])
     if each is None:
         return None
-    tuned = [c for c in plan.contenders if c.kind == "rival" and c.name not in SIMPLE]
-    seconds = each * BUDGET * len(tuned) + pace.seconds(plan.scenarios, None, len(plan.contenders))
-    seconds /= min(os.cpu_count() or 1, len(plan.contenders))
+    tuned = [c for c in plan.entrants if c.kind == "baseline" and c.name not in SIMPLE]
+    seconds = each * BUDGET * len(tuned) + pace.seconds(plan.scenarios, None, len(plan.entrants))
+    seconds /= min(os.cpu_count() or 1, len(plan.entrants))
     if seconds < pace.SAID:
         return None
     return (
@@ -195,34 +201,34 @@ def work(plan: Plan, progress: Progress) -> list[Done]:
     """All jobs done, in their order, with progress."""
     if (text := told(plan)) is not None:
         print(text, flush=True)
-    jobs = board.jobs(plan.plant, plan.contenders, plan.scenarios, plan.sweeps, plan.family_seed)
+    every = jobs.jobs(plan.plant, plan.entrants, plan.scenarios, plan.sweeps, plan.family_seed)
     done: dict[Job, Done] = {}
     shares: dict[Job, float] = {}  # of each that has begun
-    progress.phase("comparing", sum(job.work for job in jobs))
+    progress.phase("comparing", sum(job.work for job in every))
 
     def heard(job: Job, text: str, share: float) -> None:
         shares[job] = share
         progress.reach(
             sum(share * job.work for job, share in shares.items()),
-            count=f"{len(done)} of {len(jobs)} jobs",
+            count=f"{len(done)} of {len(every)} jobs",
             job=f"{job}: {text}" if text else str(job),
         )
 
-    for finished in board.spread(jobs, partial(cli.use_plants, tuple(SOURCES.values())), heard):
+    for finished in jobs.spread(every, partial(cli.use_own, tuple(REGISTRATIONS.values()), own_agents()), heard):
         done[finished.job] = finished
         heard(finished.job, f"{finished.seconds:.0f} s", 1.0)
-    return [done[job] for job in jobs]
+    return [done[job] for job in every]
 
 
 def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
     """The content of comparison.json."""
-    known = board.policies(plan.contenders, done)
-    rows = statistics.ranks(board.rows(done), known)
+    known = jobs.policies(plan.entrants, done)
+    rows = statistics.ranks(jobs.rows(done), known)
     label = {(line.policy, line.run): line.label for line in statistics.lines(rows, known)}
     plant, _ = plants.make(plan.plant)
-    swept = board.swept(done, plan.sweeps, label)
+    swept = jobs.swept(done, plan.sweeps, label)
     for sweep in swept.values():
-        sweep["best_rival"] = statistics.best_rival(sweep, known)
+        sweep["best_baseline"] = statistics.best_baseline(sweep, known)
     return {
         "format": FORMAT,
         "plant": plan.plant,
@@ -235,7 +241,7 @@ def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
         "rows": rows,
         "statistics": statistics.summarise(rows, known),
         "sweeps": swept,
-        "certificate": board.certificates(done, label),
+        "stability": jobs.stabilities(done, label),
     }
 
 
@@ -254,14 +260,14 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done], progress: P
     overall = OVERALL + len(plan.sweeps)
     progress.phase("drawing", overall + len(plan.scenarios))
     with cli.optional("figures"):
-        figures |= comparison.draw(plan.out / "figures", content)
+        figures |= comparison_figures.draw(plan.out / "figures", content)
         progress.advance(overall)
         for name in plan.scenarios:
-            traces = {label[c.line]: t for c, t in board.first_episodes(done, name).items()}
+            traces = {label[c.line]: t for c, t in jobs.first_episodes(done, name).items()}
             traces = {line.label: traces[line.label] for line in lines}
             path = plan.out / "figures" / f"{name.replace('/', '-')}.png"
             scenario = scenarios.get(name, family_seed=plan.family_seed)
-            responses[name] = comparison.responses(path, scenario, traces, [line.label for line in lines])
+            responses[name] = comparison_figures.responses(path, scenario, traces, [line.label for line in lines])
             progress.advance()
     return report.write(plan.out / "report.html", content, figures, responses)
 

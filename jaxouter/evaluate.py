@@ -1,4 +1,4 @@
-"""`python -m jaxouter.evaluate`: a trained run, or a rival, on any evaluation scenario."""
+"""`python -m jaxouter.evaluate`: a trained run, or a baseline, on any evaluation scenario."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import board, pace, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival, work
-from jaxouter.evaluation.rivals import CLAIRVOYANT, RIVALS
+from jaxouter.evaluation import baselines, jobs, pace, scenarios
+from jaxouter.evaluation.baselines import BASELINES, CLAIRVOYANT
+from jaxouter.evaluation.policies import Named, Results, baseline, counter, evaluate, result, work
 from jaxouter.progress import Progress
-from jaxouter.training.run import add_plant, open_run, write_json
+from jaxouter.training.run import add_agent, add_plant, open_run, write_json
 
 SHOWN = (
     "mae",
@@ -32,19 +32,21 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Options:
-    """Evaluate a trained run, or a rival, on scenarios that training never saw.
+    """Evaluate a trained run, or a baseline, on scenarios that training never saw.
 
     With a run folder the learned policy of its median seed is evaluated; a folder seed-N in it names another seed.
-    Without `--scenario` all scenarios of the plant are met, without a folder those of every plant.
+    Without `--scenario` all scenarios of the plant are run, without a folder those of every plant.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder, or the folder of one seed in it."""
     plant: str | None = None
     """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; without a run, that of the policy."""
+    agent: str | None = None
+    """The run's agent, if your own: FILE.py:CLASS."""
     policy: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE.py:CLASS")] = None
-    """A rival instead, such as none (r~ = r) or static (inverse of the DC gain), identified first, once; or a policy of
-    your own."""
+    """A baseline instead, such as none (r~ = r) or static (inverse of the DC gain), identified once and kept; or your
+    own policy."""
     scenario: tuple[str, ...] = ()
     """Scenarios, such as pitch/paper; see --list."""
     episodes: int | None = None
@@ -67,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
         if options.list:
             return cli.print_lists()
+        add_agent(options.agent)
         if options.plant is not None:
             options = replace(options, plant=add_plant(options.plant, options.run))
         check(options)
@@ -81,8 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rollouts = 1 if options.policy == "none" else 2
         if pace.seconds(names, options.episodes, rollouts) > pace.SAID:
             progress.print(f"{pace.told(names, options.episodes, rollouts)}; --episodes N is N of each")
-        met = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
-        results = evaluated(policies, met, options.policy, progress)
+        selected = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
+        results = evaluated(policies, selected, options.policy, progress)
     named = next(iter(policies.values()))
     show(named.name, results, origin.get("places", {}))
     if options.json is not None:
@@ -104,7 +107,7 @@ def check(options: Options) -> None:
     """
     if options.run is None and options.policy is None:
         raise ValueError(
-            f"say what to evaluate: a run folder, or --policy with FILE.py:CLASS or one of {', '.join(RIVALS)}"
+            f"say what to evaluate: a run folder, or --policy with FILE.py:CLASS or one of {', '.join(BASELINES)}"
         )
     if options.policy == CLAIRVOYANT:
         raise ValueError(f"{CLAIRVOYANT} is a bound, not a policy; python -m jaxouter.compare shows it")
@@ -132,53 +135,52 @@ def choose(options: Options, progress: Progress) -> tuple[dict[str, Named], dict
         return {name: chosen(options.policy, name, progress) for name in names}, {}
     assert options.run is not None  # as `check` found
     run, seed, _ = open_run(options.run)
-    state, _ = run.load(seed)
-    trainer, _ = run.trainer
-    named = Named("learned", trainer.policy, trainer.policy_params(state))
+    named = Named("learned", *run.policy(seed))
     origin: dict[str, Any] = {"run": str(run.path), "seed": seed}
     if run.config.randomise:
-        met = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
-        origin["places"] = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
+        selected = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
+        origin["places"] = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
     return {run.config.plant: named}, origin
 
 
 def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
-    """The user's own policy, or a rival, which is identified unless the cache has it; that is told.
+    """The user's own policy, or a baseline, which is identified unless the cache has it; that is told.
 
     Raises:
         ValueError: there is no such policy, the plant does not allow it, or it can't be made.
     """
-    found = board.contender(policy, plants.make(plant_name)[0])
+    found = jobs.entrant(policy, plants.make(plant_name)[0])
     if found.kind == "user":
-        return Named(found.name, *board.load(found, plant_name))
+        return Named(found.name, *jobs.load(found, plant_name))
 
     def heard(text: str, share: float) -> None:
         if not text:
-            progress.print(f"{policy} on {plant_name}: {RIVALS[policy].note} This is done once, and kept.")
+            note = baselines.resolve(policy).note
+            progress.print(f"{policy} on {plant_name}: {note} This is done once, and kept.")
         elif share and not progress.done:
             progress.phase(f"tuning {policy}")
         progress.reach(share, at=text)
 
     progress.phase(f"identifying {policy}", 1.0)
-    return rival(policy, plant_name, heard)
+    return baseline(policy, plant_name, heard)
 
 
 def evaluated(
-    policies: Mapping[str, Named], met: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
+    policies: Mapping[str, Named], selected: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
 ) -> Results:
     """The policy of each plant on its scenarios.
 
     Raises:
         ValueError: a user's policy, `asked` for on the command line, failed.
     """
-    pairs = [(policies[scenario.plant.name], scenario) for scenario in met]
-    plants_met = {scenario.plant.name: scenario.plant for scenario in met}.values()
+    pairs = [(policies[scenario.plant.name], scenario) for scenario in selected]
+    plants_selected = {scenario.plant.name: scenario.plant for scenario in selected}.values()
     total = sum(work(named.name, scenario) for named, scenario in pairs)
-    progress.phase("evaluating", total, counter=counter(plants_met))
+    progress.phase("evaluating", total, counter=counter(plants_selected))
     results: Results = {}
     for i, (named, scenario) in enumerate(pairs):
-        progress.say(scenario=f"{scenario.id}, {i + 1} of {len(met)} scenarios")
-        with board.blamed(named.name, f"failed on {scenario.id}", asked not in (None, *RIVALS)):
+        progress.say(scenario=f"{scenario.id}, {i + 1} of {len(selected)} scenarios")
+        with jobs.blamed(named.name, f"failed on {scenario.id}", jobs.is_own(asked)):
             results |= evaluate(named, [scenario])
         progress.advance(work(named.name, scenario))
     return results

@@ -13,10 +13,10 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli
-from jaxouter.deploy import c, fmu, verify
-from jaxouter.deploy.law import Law
+from jaxouter.exports import c, fmu, verify
+from jaxouter.exports.spec import ControllerSpec
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.run import add_plant, open_run
+from jaxouter.training.run import add_agent, add_plant, open_run
 
 FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
 
@@ -25,7 +25,7 @@ FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
 class Options:
     """Export the controller that a run has learned: history, scaling, network and bounds, with its state explicit.
 
-    --format may be: onnx (a graph; needs the extra onnx), npz (the numbers, for jaxouter.deploy.law, which is NumPy),
+    --format may be: onnx (a graph; needs the extra onnx), npz (the numbers, for jaxouter.exports.spec, which is NumPy),
     stablehlo (for jax.export), c (C99 without memory allocation: a .c and a .h file) or fmu (FMI 2.0 co-simulation;
     needs a C compiler). The file is run beside the policy before it is put in its place.
     """
@@ -34,6 +34,8 @@ class Options:
     """Run folder (its median seed is exported), or the folder of one seed in it."""
     plant: str | None = None
     """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; its options are those of the run."""
+    agent: str | None = None
+    """The run's agent, if your own: FILE.py:CLASS."""
     format: str | None = None
     """onnx, npz, stablehlo, c or fmu."""
     out: Path | None = None
@@ -51,23 +53,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_path, kind, out = check(options)
         run, seed, _ = open_run(run_path)
         cli.use_compilation_cache()
-        state, _ = run.load(seed)
-        trainer, _ = run.trainer
-        policy, params = trainer.policy, trainer.policy_params(state)
-        law = Law.of(policy, params, trainer.env.plant)
+        policy, params = run.policy(seed)
+        spec = ControllerSpec.of(policy, params, run.trainer[0].env.plant)
         progress = stack.enter_context(cli.progress())
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent))
         made = Path(place) / out.name
         progress.phase("writing")
-        write(kind, made, law, policy, params)
+        write(kind, made, spec, policy, params)
         progress.phase("verifying")
-        found = verified(kind, made, law, policy, params)
+        found = verified(kind, made, spec, policy, params)
         for path in written(kind, made):
             path.replace(out.with_name(path.name))
-    low, high = law.r_tilde_bounds
+    low, high = spec.r_tilde_bounds
     print(
-        f"{law.plant}, seed {seed}: r~ in [{low:g}, {high:g}] {law.y_unit} from r and y in {law.y_unit}, once every "
-        f"{law.control_step:g} {law.time_unit}; state: {law.history} past y, {law.history} past r~, integral"
+        f"{spec.plant}, seed {seed}: r~ in [{low:g}, {high:g}] {spec.y_unit} from r and y in {spec.y_unit}, once every "
+        f"{spec.control_step:g} {spec.time_unit}; state: {spec.history} past y, {spec.history} past r~, integral"
     )
     for path in written(kind, out):
         print(f"written: {path} ({path.stat().st_size / 1000:.1f} kB)")
@@ -90,6 +90,7 @@ def check(options: Options) -> tuple[Path, str, Path]:
         asked = "say --format" if kind is None else f"there is no format {kind!r}"
         raise ValueError(f"{asked}; the formats are: {', '.join(FORMATS)}")
     out = run / f"controller.{kind}" if options.out is None else options.out
+    add_agent(options.agent)
     named = None if options.plant is None else add_plant(options.plant, run)
     opened, seed, _ = open_run(run)
     made_on = opened.config.plant
@@ -120,41 +121,41 @@ def written(kind: str, out: Path) -> list[Path]:
 def needed(kind: str) -> None:
     """Raises ImportError or FileNotFoundError where what makes a format is not installed."""
     if kind == "onnx":
-        from jaxouter.deploy import onnx  # noqa: F401
+        from jaxouter.exports import onnx  # noqa: F401
     elif kind == "stablehlo":
-        from jaxouter.deploy import stablehlo  # noqa: F401
+        from jaxouter.exports import stablehlo  # noqa: F401
     elif kind == "fmu":
         c.compiler()
         fmu.platform_folder()
 
 
-def write(kind: str, path: Path, law: Law, policy: LearnedPolicy, params: LearnedParams) -> None:
+def write(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> None:
     """Write the controller in a format."""
     match kind:
         case "onnx":
-            from jaxouter.deploy import onnx
+            from jaxouter.exports import onnx
 
-            onnx.save(law, path)
+            onnx.save(spec, path)
         case "npz":
-            law.save(path)
+            spec.save(path)
         case "stablehlo":
-            from jaxouter.deploy import stablehlo
+            from jaxouter.exports import stablehlo
 
             stablehlo.save(policy, params, path)
         case "c":
-            c.save(law, path)
+            c.save(spec, path)
         case "fmu":
-            fmu.save(law, path)
+            fmu.save(spec, path)
 
 
-def verified(kind: str, path: Path, law: Law, policy: LearnedPolicy, params: LearnedParams) -> str:
+def verified(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> str:
     """What running the file showed, in a line.
 
     Raises:
         SystemExit: it is not what the policy does.
     """
     try:
-        found = verify.verify(kind, path, law, policy, params)
+        found = verify.verify(kind, path, spec, policy, params)
     except (ImportError, FileNotFoundError) as error:
         return f"not verified: {error}"
     text = (

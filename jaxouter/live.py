@@ -16,13 +16,13 @@ import numpy as np
 import tyro
 
 from jaxouter import cli
-from jaxouter.deploy.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
-from jaxouter.deploy.realtime import Loop, Row, Settings, StepError, run
 from jaxouter.evaluation import figures
 from jaxouter.plants.errors import Raised
-from jaxouter.plants.sources import attribute
+from jaxouter.plants.registry import attribute
 from jaxouter.progress import Progress
-from jaxouter.training.run import add_plant, write_json
+from jaxouter.runtime.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
+from jaxouter.runtime.realtime import Loop, Row, StepError, Timing, run
+from jaxouter.training.run import add_agent, add_plant, write_json
 
 KEPT = {"static": "static inverse", "trained": "as trained"}
 
@@ -55,7 +55,9 @@ class Options:
     updates: int = 8
     """Most updates a period."""
     plant: str | None = None
-    """The run's plant, where it is your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
+    """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
+    agent: str | None = None
+    """The run's agent, if your own: FILE.py:CLASS."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show the trace of an error too."""
 
@@ -65,15 +67,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with cli.user_errors(arguments), ExitStack() as stack:
         options = tyro.cli(Options, prog="python -m jaxouter.live", args=arguments)
         plant = check(options)
+        add_agent(options.agent)
         if options.plant is not None:
             add_plant(options.plant, options.run)
         folder = open_folder(options.run, options.declaration, options.learn)
         cli.use_compilation_cache()
         live, state = folder.begin()
-        said, declared = folder.declaration, live.trainer.env.plant
+        said, declared = folder.declaration, live.env.plant
         r = reference(options.reference, declared.setpoint_range, said.episode_steps, said.seed)
-        stack.enter_context(folder.lock(live))
-        settings = Settings(said.dt, options.learn, options.record, options.updates)
+        stack.enter_context(folder.lock())
+        settings = Timing(said.dt, options.learn, options.record, options.updates)
         before = folder.columns().get("time", np.zeros(0))
         begin = float(before[-1]) + 2 * said.dt if len(before) else 0.0  # a gap, where it was stopped
         loop = Loop(live, state, plant, lambda k: float(r[k % len(r)]), settings, begin)
@@ -175,7 +178,7 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     columns = folder.columns()
     found = summary(loop, columns)
     write_json(folder.path / "summary.json", found)
-    unit = loop.live.trainer.env.plant.y_unit
+    unit = loop.live.env.plant.y_unit
     cli.table(
         "MAE: of y, and of what it would have been on the same steps",
         ["", "y", "had r passed", KEPT[loop.live.kept], "learned"],

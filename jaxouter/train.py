@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import math
@@ -21,27 +22,29 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures, pace, scenarios
-from jaxouter.evaluation.evaluate import Named, Results, counter, evaluate, result, rival
+from jaxouter.evaluation.baselines import SIMPLE
 from jaxouter.evaluation.metrics import mae
-from jaxouter.evaluation.rivals import SIMPLE
+from jaxouter.evaluation.policies import Named, Results, baseline, counter, evaluate, result
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
 from jaxouter.plants import Plant
 from jaxouter.plants.errors import PlantError
-from jaxouter.plants.sources import add, own_errors
+from jaxouter.plants.registry import add, own_errors
 from jaxouter.progress import Progress, clock
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.choice import choose
 from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict
 from jaxouter.training.devices import Fleet, Processes
-from jaxouter.training.plan import plan
-from jaxouter.training.pretraining import Rehearsal
-from jaxouter.training.run import FORMAT, Run, write_json
-from jaxouter.training.train import NotFiniteError, Pace, Row, train
-from jaxouter.training.trainer import Trainer, TrainState
+from jaxouter.training.environments import TrainState
+from jaxouter.training.epochs import NotFiniteError, Pace, Row, train
+from jaxouter.training.pretraining import PretrainingState
+from jaxouter.training.resources import arithmetic, arithmetic_lines, resources
+from jaxouter.training.run import FORMAT, Run, add_agent, lock, write_json
+from jaxouter.training.trainer import Trainer
 
 LOOK_SECONDS = 5.0  # between two looks at the MAE during the pretraining, at least
 FRESH = 4  # folded into a key
+PROCESSES = tuple(Processes.__dataclass_fields__)
 WATCHING = 0.1  # of the time of learning so far, which the first look at the MAE may take of a plant outside JAX
 
 
@@ -50,16 +53,18 @@ class Options:
     """Train an outer loop on a plant (pitch, heaters or your own) and show what came out.
 
     Without options the pitch plant is learned with the default preset. The preset sets every other field; what is
-    given here overrides it. `--list` prints plants, presets, scenarios and policies.
+    given here overrides it. `--list` prints plants, presets, scenarios, agents and policies.
     """
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    agent: str | None = None
+    """Agent that learns, or FILE.py:CLASS, its settings, of your own; default: that of the preset. See --list."""
     out: Path | None = None
     """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Go on with the run in this folder; takes no other option but a plant of your own, which is named
-    again, --episodes, --tensorboard, --dry-run, --debug, --devices (draws go on
-    otherwise where a learner then spans another number of them) and how to find the other processes."""
+    """Go on with the run in this folder; takes no other option but a plant and an agent of your own, which are named
+    again, --episodes, --tensorboard, --dry-run, --debug, --devices (results differ if a learner then spans another
+    number of them) and how to find the other processes."""
     coordinator: str | None = None
     """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
     several SLURM tasks or an indexed Kubernetes job (with `jax[k8s]`) JAX finds this and the next two by itself."""
@@ -81,26 +86,32 @@ class Options:
 
 
 def parse(arguments: list[str]) -> Options:
-    """The options; plant and preset are read first, since they set the defaults of all others."""
+    """The options; agent, plant and preset are read first, since they set the defaults of all others."""
     program = "python -m jaxouter.train"
-    first = Options(preset("pitch"))
+    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    named.add_argument("--agent")
+    agent = named.parse_known_args(arguments)[0].agent
+    agent = add_agent(agent)
+    first = Options(preset("pitch", agent=agent), agent)
     plain = [argument for argument in arguments if argument not in ("-h", "--help")]
     config = tyro.cli(Options, prog=program, args=plain, default=first).config
     plant = add(config.plant, config.plant_options)
-    options = tyro.cli(Options, prog=program, args=arguments, default=Options(preset(plant, config.preset)))
+    default = Options(preset(plant, config.preset, agent), agent)
+    options = tyro.cli(Options, prog=program, args=arguments, default=default)
     options = dataclasses.replace(options, config=dataclasses.replace(options.config, plant=plant))
     if options.resume is not None:
         execution = {
             name: getattr(options, name)
-            for name in ("resume", "dry_run", "tensorboard", "debug", "episodes", *Processes.__dataclass_fields__)
+            for name in ("agent", "resume", "dry_run", "tensorboard", "debug", "episodes", *PROCESSES)
         }
         config = dataclasses.replace(
-            preset(plant), devices=options.config.devices, plant_options=options.config.plant_options
+            preset(plant, agent=agent), devices=options.config.devices, plant_options=options.config.plant_options
         )
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
-                "--resume takes no other option but a plant of your own, --devices, --coordinator, --num-processes, "
-                "--process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds them all"
+                "--resume takes no other option but a plant or an agent of your own, --devices, --coordinator, "
+                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds "
+                "them all"
             )
         run = Run.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
@@ -125,7 +136,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
         if options.dry_run:
             config = config if options.resume is not None else chosen(config)
-            lines = plan(config).lines
+            lines = resources(config).lines + arithmetic_lines(config)
             print(json.dumps(to_dict(config), indent=2))
             return cli.table(f"{config.plant}, preset {config.preset}", ["what", "is"], lines)
         if options.tensorboard:
@@ -135,17 +146,16 @@ def main(arguments: list[str] | None = None) -> None:
         with cli.progress(devices.is_first()) as progress, ExitStack() as stack:
             progress.phase("preparing")
             config = config if options.resume is not None else chosen(config)
-            planned = plan(config)
-            planned.check()
+            resources(config).check()
             Fleet.of(config)  # what is left of the checks, before anything is written
             path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
             run = Run(Path(path), config)
-            devices.text_from_first(lambda: stack.enter_context(run.lock()) or "")
+            devices.text_from_first(lambda: stack.enter_context(lock(run.path)) or "")
             try:
                 new = options.resume is None and devices.is_first()
                 with own_errors():
                     with run.gone_if_nothing_is_learned() if new else nullcontext():
-                        finals = learn(run, options, progress, planned.flop)
+                        finals = learn(run, options, progress)
                     if devices.is_first() and finals is not None:
                         report(run, finals, begun, progress, options.episodes)
             except PlantError as error:
@@ -181,7 +191,7 @@ def go_on(run: Run) -> str:
     return f"go on with: python -m jaxouter.train --resume {run.path}"
 
 
-def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, float]) -> dict[int, TrainState] | None:
+def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainState] | None:
     """Train with progress, until the end or a signal."""
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
@@ -190,7 +200,7 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
     if devices.is_first():
         for change in run.changes() if options.resume is not None else ():
             print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
-    begun, first = time.perf_counter(), scenarios.paper_scenarios(config.plant)[0]
+    begun, first = time.perf_counter(), scenarios.reported(config.plant)[0]
 
     @cache
     def watched() -> scenarios.Scenario:
@@ -201,7 +211,7 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
         traces = rollout(trainer.policy, trainer.policy_params(state), watched(), record_members=True)
         return {"mae": mae(traces)}
 
-    shown = Learning(progress, config, plants.make(config.plant)[0], first, flop)
+    shown = Learning(progress, config, plants.make(config.plant)[0], first)
     stopping = cli.Interrupt("what runs now ends, then everything is saved")
     with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
@@ -220,13 +230,13 @@ def learn(run: Run, options: Options, progress: Progress, flop: tuple[float, flo
 class Learning:
     """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
 
-    def __init__(
-        self, progress: Progress, config: TrainConfig, plant: Plant, watched: str, flop: tuple[float, float]
-    ) -> None:
-        """Args: watched: id of what the MAE is of; flop: of a gradient step of the pretraining, and of an update."""
+    def __init__(self, progress: Progress, config: TrainConfig, plant: Plant, watched: str) -> None:
+        """Args: watched: id of what the MAE is of."""
         self._progress, self._config, self._plant, self._watched = progress, config, plant, watched
         start, updates = config.pretraining.gradient_steps, config.total_updates
-        self._gradient_steps, self._weights = config.seeds * (start + updates), flop
+        self._gradient_steps = config.seeds * (start + updates)
+        # A gradient step of the pretraining and an update differ in their work only where there are both.
+        self._weights = arithmetic(config) if start and updates else (1.0, 1.0)
         self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))
         self._done: dict[int, tuple[int, int]] = dict.fromkeys(range(config.seed, config.seed + config.seeds), (0, 0))
         self._maes: dict[int, str] = {}
@@ -246,7 +256,7 @@ class Learning:
             self._what = what
         self._progress.say(pieces=f"{done} of {of} plants" if of > 1 else "")
 
-    def pretrained(self, seed: int, at: Rehearsal, look: Callable[[], Row]) -> None:
+    def pretrained(self, seed: int, at: PretrainingState, look: Callable[[], Row]) -> None:
         """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
         if self._plant.differentiable:
             if self._pace.due():
@@ -295,26 +305,26 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, params) = run.config.plant, run.trainer
     seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / run.config.side_by_side
-    identifiers, rollouts = scenarios.paper_scenarios(plant), len(finals) + len(SIMPLE)
+    identifiers, rollouts = scenarios.reported(plant), len(finals) + len(SIMPLE)
     if episodes is None:
         episodes = pace.affordable(identifiers, rollouts, seconds)
         if episodes is not None and episodes < scenarios.FAMILY_MEMBERS:
             text = pace.told(identifiers, episodes, rollouts)
             progress.print(f"evaluation: {text}, as long as learning took at most; --episodes sets another number")
-    met = [scenarios.get(identifier, episodes) for identifier in identifiers]
-    total = rollouts * sum(scenario.r.size for scenario in met)
-    progress.phase("evaluating", total, counter=counter([met[0].plant]))
-    places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in met}
-    simple = {name: rival(name, plant) for name in SIMPLE}
+    selected = [scenarios.get(identifier, episodes) for identifier in identifiers]
+    total = rollouts * sum(scenario.r.size for scenario in selected)
+    progress.phase("evaluating", total, counter=counter([selected[0].plant]))
+    places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
+    simple = {name: baseline(name, plant) for name in SIMPLE}
     policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
 
     def evaluated(named: Named, alone: Results | None) -> Results:
-        return evaluate(named, met, True, alone, lambda scenario: progress.advance(scenario.r.size))
+        return evaluate(named, selected, True, alone, lambda scenario: progress.advance(scenario.r.size))
 
     alone = evaluated(simple["none"], None)
     simple_results = {name: alone if name == "none" else evaluated(named, alone) for name, named in simple.items()}
     learned = {seed: evaluated(named, alone) for seed, named in policies.items()}
-    by_mae = sorted(learned, key=lambda seed: learned[seed][met[0].id][1]["mae"] or np.inf)
+    by_mae = sorted(learned, key=lambda seed: learned[seed][selected[0].id][1]["mae"] or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
     of_seeds = {seed: named.params for seed, named in policies.items()}
@@ -328,49 +338,53 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
         "identification_steps": run.config.identification_steps,
         "updates": run.config.total_updates,
         "places": places,
-        "episodes": {scenario.id: len(scenario.r) for scenario in met},
+        "episodes": {scenario.id: len(scenario.r) for scenario in selected},
         "verdict": verdict,
         "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
     }
     write_json(run.path / "summary.json", summary)
-    show(met, simple_results, learned, places if run.config.randomise else {})
+    show(selected, simple_results, learned, places if run.config.randomise else {})
     progress.print(verdict["text"])
-    progress.phase("drawing", len(met) + 2)
+    progress.phase("drawing", len(selected) + 2)
     main_figure = ""
     with cli.optional("figures"):
-        main_figure = f", main figure {draw(run, met, simple_results, learned[median], progress.advance)}"
+        main_figure = f", main figure {draw(run, selected, simple_results, learned[median], progress.advance)}"
     progress.print(f"{time.perf_counter() - begun:.0f} s in all; run folder {run.path}{main_figure}")
 
 
 def draw(
-    run: Run, met: list[scenarios.Scenario], simple: dict[str, Results], learned: Results, drawn: Callable[[], None]
+    run: Run,
+    selected: list[scenarios.Scenario],
+    simple: dict[str, Results],
+    learned: Results,
+    drawn: Callable[[], None],
 ) -> Path:
     """Write every figure, of each of which `drawn` hears; returns the main one."""
     inner_traces, traces = ({name: t for name, (t, _) in results.items()} for results in (simple["none"], learned))
-    for scenario in met:
+    for scenario in selected:
         name = scenario.id.replace("/", "-")
         figures.response(run.figures / f"{name}.png", scenario, inner_traces[scenario.id], traces[scenario.id])
         drawn()
-    levels = {name: results[met[0].id][1]["mae"] for name, results in simple.items()}
-    levels |= {"paper's DRL": met[0].paper[1]} if met[0].paper else {}
+    levels = {name: results[selected[0].id][1]["mae"] for name, results in simple.items()}
+    levels |= {"paper's DRL": selected[0].paper[1]} if selected[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
-    title = f"{met[0].id}, MAE [{met[0].plant.y_unit}]"
+    title = f"{selected[0].id}, MAE [{selected[0].plant.y_unit}]"
     if run.config.epochs:
         figures.learning_curve(run.figures / "learning-curve.png", rows, levels, title)
         drawn()
-    return figures.paper(run.figures / "paper.png", met, inner_traces, traces)
+    return figures.paper(run.figures / "paper.png", selected, inner_traces, traces)
 
 
 def show(
-    met: list[scenarios.Scenario],
+    selected: list[scenarios.Scenario],
     simple: dict[str, Results],
     learned: dict[int, Results],
     places: Mapping[str, str],
 ) -> None:
     """Print the table; with several seeds the median, least and largest MAE; places and the paper's figures if any."""
-    rows, of_paper = [], any(scenario.paper for scenario in met)
-    for scenario in met:
+    rows, of_paper = [], any(scenario.paper for scenario in selected)
+    for scenario in selected:
         of_seeds = [results[scenario.id][1] for results in learned.values()]
         values = [figures["mae"] for figures in of_seeds if figures["mae"] is not None]
         ours = cli.number(statistics.median(values)) if len(values) == len(of_seeds) else "diverged"
@@ -383,7 +397,7 @@ def show(
         place = [places[scenario.id]] if places else []
         printed = [paper] if of_paper else []
         rows.append([scenario.id, *place, cli.number(inner), cli.number(static), *printed, ours, improvement])
-    unit = met[0].plant.y_unit
+    unit = selected[0].plant.y_unit
     columns = ["scenario", *(["plant"] if places else [])]
     columns += [
         "inner loop alone",

@@ -118,7 +118,7 @@ def program(page: Path, found: Sequence[Block]) -> str:
 
 
 def outcome(page: Path, found: Sequence[Block], place: Path) -> Outcome:
-    """Run a page in a copy of its own, with results of rivals and compiled functions kept from page to page only."""
+    """Run a page in a copy of its own, with results of baselines and compiled functions kept from page to page only."""
     print(f"== {page}", flush=True)
     copy, begun = place / "checkout", time.monotonic()
     copied(copy)

@@ -2,6 +2,7 @@
 
     python scripts/golden.py            # compares with tests/golden.json; status 1 where something differs
     python scripts/golden.py --write    # makes that file anew
+    python scripts/golden.py --only heaters-td3    # of the trainings this one, and what is made of it
 
 Every array is kept as its hash and a few of its elements. On the kind of machine and the version of jaxlib that wrote
 the file the hashes must agree, which is equality to the last bit; elsewhere the elements must, to a small tolerance.
@@ -36,20 +37,32 @@ ELEMENTS = 16  # of each array, evenly spaced
 TOLERANCE = 1e-3  # of the largest of them, on other machines
 PAPER = ["--preset", "paper", "--steps", "205", "--epoch", "5"]  # five updates
 DEFAULT = ["--pretraining.gradient-steps", "50"]
-TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--prefill", "640", "--epoch", "400"]
-TD3 += ["--environments", "8", "--redraw", "0.05", "--noise-end", "0.5", "--ddpg.n-step", "3"]
-TD3 += ["--ddpg.critics", "2", "--ddpg.policy-delay", "2", "--ddpg.target-noise", "0.2", "--ddpg.hidden", "32", "32"]
+TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--agent.prefill", "640", "--epoch", "400"]
+TD3 += ["--environments", "8", "--redraw", "0.05", "--agent.noise-end", "0.5", "--agent.n-step", "3"]
+TD3 += [
+    "--agent.critics",
+    "2",
+    "--agent.policy-delay",
+    "2",
+    "--agent.target-noise",
+    "0.2",
+    "--agent.hidden",
+    "32",
+    "32",
+]
 
 
-def main(write: bool = False) -> None:
+def main(write: bool = False, only: tuple[str, ...] = ()) -> None:
     """Compare the results with those in the file, or write them to it."""
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        found = {"machine": machine(), "results": dict(sorted(results(Path(folder)).items()))}
+        found = {"machine": machine(), "results": dict(sorted(results(Path(folder), only).items()))}
     if write:
         FILE.write_text(json.dumps(found, indent=0) + "\n")
         print(f"{len(found['results'])} results written to {FILE}")
         return
     wanted = json.loads(FILE.read_text())
+    if only:
+        wanted["results"] = {name: value for name, value in wanted["results"].items() if name in found["results"]}
     exact = wanted["machine"] == found["machine"]
     wrong = differences(wanted["results"], json.loads(json.dumps(found["results"])), exact)
     print("\n".join(wrong) or f"{len(wanted['results'])} results agree, {'to the last bit' if exact else 'about'}")
@@ -66,15 +79,19 @@ def machine() -> dict[str, str]:
     return {"processor": platform.machine(), "features": features, "jaxlib": version("jaxlib")}
 
 
-def results(folder: Path) -> dict[str, Any]:
-    """All results, by name."""
+def results(folder: Path, only: tuple[str, ...]) -> dict[str, Any]:
+    """Results by name; all, unless only those of some trainings are asked for."""
     found: dict[str, Any] = {}
     for plant in ("pitch", "heaters"):
         for name, options in (("paper", PAPER), ("default", DEFAULT), ("td3", TD3)):
             path = folder / f"{plant}-{name}"
+            if only and path.name not in only:
+                continue
             train.main([plant, *options, "--out", str(path)])
             found |= {f"{path.name}/{key}": value for key, value in trained(path).items()}
     run = folder / "pitch-default"
+    if not run.exists():
+        return found
     for kind in ("npz", "c"):
         export.main([str(run), "--format", kind, "--force"])
     with np.load(run / "controller.npz") as file:
@@ -85,7 +102,7 @@ def results(folder: Path) -> dict[str, Any]:
     scenarios = ["pitch/paper", "pitch/delay-0.57", "pitch/noise", "pitch/load", "pitch/steps"]
     policies = ["--run", str(run), "--policy", "static"]
     compare.main(["pitch", *policies, "--scenario", *scenarios, "--sweep", "pitch/gain", "--out", str(out)])
-    found["compare"] = numbers(json.loads((out / "comparison.json").read_text()), ("rows", "sweeps", "certificate"))
+    found["compare"] = numbers(json.loads((out / "comparison.json").read_text()), ("rows", "sweeps", "stability"))
     return found
 
 
@@ -94,14 +111,14 @@ def trained(path: Path) -> dict[str, Any]:
     run = Run.open(path)
     state, _ = run.load(0)
     trainer, params = build(preset(run.config.plant, run.config.preset))
-    fresh = trainer.fresh(jax.random.key(0), params).learner
+    fresh = trainer.fresh(jax.random.key(0), params).agent
     summary = json.loads((path / "summary.json").read_text())
     trees = {
         "initial": (fresh.actor, fresh.critics),
-        "learner": (state.learner.actor, state.learner.critics, state.learner.target_actor),
-        "replay": state.replay.rows,
-        "loop": (state.env.r, state.env.y, state.obs, state.noise, jax.random.key_data(state.key)),
-        "base": tuple(state.prior),
+        "learner": (state.agent.actor, state.agent.critics, state.agent.target_actor),
+        "replay": state.data.rows,
+        "loop": (state.env.r, state.env.y, state.obs, state.noise.x, jax.random.key_data(state.key)),
+        "base": tuple(state.base),
     }
     rows = [{name: value for name, value in row.items() if "second" not in name} for row in run.rows(0)]
     arrays = {f"{name}/{i}": array(x) for name, tree in trees.items() for i, x in enumerate(jax.tree.leaves(tree))}

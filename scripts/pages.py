@@ -87,7 +87,7 @@ def results() -> str:
 def rows(plant: str) -> Iterator[list[str]]:
     """Those of a plant."""
     kept = {preset: json.loads((RESULTS / f"{plant}-{preset}.json").read_text())["results"] for preset in PRESETS}
-    for name in scenarios.paper_scenarios(plant):
+    for name in scenarios.reported(plant):
         published = scenarios.get(name, 1).paper
         yield [
             name,

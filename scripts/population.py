@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.loop import identify
+from jaxouter.identification import identify
 from jaxouter.plants import Plant
 from jaxouter.plants.heaters import Law
 from jaxouter.training.devices import Processes, connect, spread
@@ -60,10 +60,10 @@ def main() -> None:
     options = tyro.cli(Options)
     with cli.user_errors():
         connect(options.devices, Processes())
-        prior = identify.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # from four houses
+        base = identify.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # from four houses
         plant, params = plants.make("heaters", n=options.houses, law=options.law)
         params = spread(params, options.houses, options.devices)
-    r_tilde = jnp.clip(prior.offset + prior.slope * options.r, *plant.r_tilde_bounds)
+    r_tilde = jnp.clip(base.offset + base.slope * options.r, *plant.r_tilde_bounds)
     begun = time.perf_counter()
     compiled = run.lower(plant, params, r_tilde, jax.random.key(options.seed), options.hours).compile()
     compiling = time.perf_counter() - begun

@@ -36,14 +36,14 @@ TRAINING = (  # of which a piece as long as a start of the process holds some gr
         "16",
         "--environments",
         "8",
-        "--prefill",
+        "--agent.prefill",
         "640",
         "--epoch",
         "800",
-        "--replay",
+        "--agent.replay",
         "40000",
     ),
-    *("--ddpg.hidden", "32", "32", "--ddpg.batch-size", "32", "--updates", "8"),
+    *("--agent.hidden", "32", "32", "--agent.batch-size", "32", "--agent.updates", "8"),
 )
 
 

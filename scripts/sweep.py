@@ -23,18 +23,18 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.evaluate import Named, evaluate
+from jaxouter.evaluation.policies import Named, evaluate
 from jaxouter.training.run import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
 DDPG_ALONE = ("--pretraining.gradient-steps", "0", "--steps")
-THEN_DDPG = ("--steps", "38000", "--ddpg.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
+THEN_DDPG = ("--steps", "38000", "--agent.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
     "500-gradient-steps": ("--pretraining.gradient-steps", "500"),
     "16-episodes": ("--pretraining.episodes", "16"),
     "undisturbed": ("--pretraining.noise", "0", "--pretraining.load", "0"),
-    "then-ddpg-3e-6": (*THEN_DDPG, "--ddpg.actor-rate", "3e-6"),
+    "then-ddpg-3e-6": (*THEN_DDPG, "--agent.actor-rate", "3e-6"),
     "ddpg-alone": (*DDPG_ALONE, "128000"),
 }
 
@@ -51,7 +51,7 @@ class Options:
     """Where the run folders are."""
 
 
-def met_on(plant: str) -> list[str]:
+def selected_on(plant: str) -> list[str]:
     """The scenarios in which the inner loop alone is stable."""
     return [name for name in scenarios.catalogue(plant) if scenarios.get(name, 1).stable_alone]
 
@@ -59,10 +59,10 @@ def met_on(plant: str) -> list[str]:
 def line(name: str, run: Run) -> list[str]:
     """Variant, seeds, median MAE of each scenario, and seconds a seed, start included."""
     trainer, _ = run.trainer
-    met = [scenarios.get(identifier) for identifier in met_on(run.config.plant)]
+    selected = [scenarios.get(identifier) for identifier in selected_on(run.config.plant)]
     policies = [Named("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
-    found = [evaluate(policy, met) for policy in policies]
-    of_each = [[results[scenario.id][1]["mae"] for results in found] for scenario in met]
+    found = [evaluate(policy, selected) for policy in policies]
+    of_each = [[results[scenario.id][1]["mae"] for results in found] for scenario in selected]
     seconds = (run.path / "seconds").read_text()
     return [name, str(run.config.seeds), *(f"{statistics.median(maes):.3f}" for maes in of_each), seconds]
 
@@ -92,7 +92,7 @@ def main(options: Options) -> None:
     for plant in ("pitch", "heaters"):
         for name in options.only:
             train(plant, name, options)
-        header = ["change", "seeds", *(identifier.split("/")[1] for identifier in met_on(plant)), "s"]
+        header = ["change", "seeds", *(identifier.split("/")[1] for identifier in selected_on(plant)), "s"]
         rows = [
             line(name, Run.open(options.runs / f"{plant}-{name}"))
             for name in VARIANTS

@@ -24,7 +24,7 @@ LONGEST = ("test_faults", "test_devices", "test_trainer", "test_pretraining", "t
 
 @pytest.fixture(scope="session", autouse=True)
 def results_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Results of rivals are made anew: their cache does not know of the plants in the tests."""
+    """Results of baselines are made anew: their cache does not know of the plants in the tests."""
     os.environ["MPLCONFIGDIR"] = matplotlib.get_cachedir()  # else matplotlib would search all fonts again
     os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
 

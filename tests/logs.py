@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxouter.loop.log import Log
+from jaxouter.identification.recorded_data import Log
 from jaxouter.loop.references import telegraph
 from jaxouter.plants import Plant, simulate
 

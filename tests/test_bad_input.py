@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import hashlib
 import io
 import json
 from pathlib import Path
@@ -14,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from jaxouter import evaluate, train
 from jaxouter.loop import references
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict
-from jaxouter.training.plan import plan
+from jaxouter.training.resources import resources
 from jaxouter.training.run import Run
 from tests.training.small import small
 
@@ -36,9 +37,9 @@ values = st.recursive(
     max_leaves=5,
 )
 PATHS = [
-    *((name,) for name in to_dict(small()) if name not in ("ddpg", "pretraining")),
-    *((group, name) for group in ("ddpg", "pretraining") for name in to_dict(small())[group]),
-    ("ddpg",), ("pretraining",), ("unknown",), ("ddpg", "unknown"),
+    *((name,) for name in to_dict(small()) if name not in ("agent", "pretraining")),
+    *((group, name) for group in ("agent", "pretraining") for name in to_dict(small())[group]),
+    ("agent",), ("pretraining",), ("unknown",), ("agent", "unknown"),
 ]  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def outcome(values_of_config: dict) -> TrainConfig | str:
     """The configuration, checked as the command checks it, or what is wrong."""
     try:
         config = from_dict(values_of_config).check()
-        plan(config).check()
+        resources(config).check()
         return config
     except ValueError as error:
         return str(error)
@@ -80,18 +81,25 @@ def test_a_configuration_of_another_type_is_refused_by_name(path):
         ({"steps": 10**15}, "steps is 1000000000000000; it must be a number between"),
         ({"reward_scale": np.nan}, "reward_scale is nan"),
         ({"seeds": 10**8}, "this run needs about"),
-        ({"environments": 10**9, "steps": 10**9, "prefill": 10**9, "epoch": 10**9}, "prefill is 1000000000"),
-        ({"environments": 10**8, "steps": 2 * 10**9, "prefill": 10**9, "epoch": 10**9}, "this run needs about"),
+        (
+            {"environments": 10**9, "steps": 10**9, "agent.prefill": 10**9, "epoch": 10**9},
+            "agent.prefill is 1000000000",
+        ),
+        ({"environments": 10**8, "steps": 2 * 10**9, "agent.prefill": 10**9, "epoch": 10**9}, "this run needs about"),
     ],
 )
 def test_numbers_beyond_any_use_are_refused(changes, text):
-    assert text in str(outcome(to_dict(small()) | changes))
+    content = to_dict(small())
+    for name, value in changes.items():
+        group, _, field = name.rpartition(".")
+        (content[group] if group else content)[field] = value
+    assert text in str(outcome(content))
 
 
 OPTIONS = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(TrainConfig) if field.name != "plant"]
 OPTIONS += [
-    "--ddpg.hidden",
-    "--ddpg.batch-size",
+    "--agent.hidden",
+    "--agent.batch-size",
     "--pretraining.lags",
     "--resume",
     "--out",
@@ -166,17 +174,24 @@ def tree():
     return {"a": jnp.arange(300.0), "key": jax.random.key(7), "b": (jnp.ones((2, 2), jnp.int32),)}
 
 
+def signed(content: bytes) -> bytes:
+    """With a checksum that is right, as anybody can make one."""
+    return bytes(content) + checkpoint.MARK + hashlib.sha256(content).digest()
+
+
 @some
 @given(data=st.data(), summed=st.booleans())
 def test_a_damaged_checkpoint_is_refused_whatever_the_damage(data, summed, tmp_path):
-    """Also one without the checksum, of which every byte reaches zipfile and NumPy: it may be read, if it is equal."""
+    """Also one that was signed anew, of which every byte reaches zipfile and NumPy: it may be read, if it is equal."""
     path = tmp_path / "c.npz"
     checkpoint.save(path, tree(), epoch=1)
-    content = bytearray(path.read_bytes()) if summed else bytearray(path.read_bytes()[: -len(checkpoint.MARK) - 32])
+    content = bytearray(path.read_bytes())[: None if summed else -len(checkpoint.MARK) - 32]
+    before = bytes(content)
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
-    content = content[: data.draw(st.sampled_from([len(content), len(content) - 1, len(content) // 2]))]
-    path.write_bytes(content)
+    damaged = content[: data.draw(st.sampled_from([len(content), len(content) - 1, len(content) // 2]))]
+    assume(damaged != before)
+    path.write_bytes(damaged if summed else signed(damaged))
     with contextlib.suppress(ValueError):
         loaded, _ = checkpoint.load(path, jax.eval_shape(tree))
         assert not summed
@@ -211,7 +226,9 @@ def test_a_run_folder_from_someone_else_executes_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = Run.create(small(), tmp_path / "run")
     path = run.seed_folder(0) / "checkpoint-000001.npz"
-    np.savez(path, header=np.asarray(json.dumps({"format": 1})), planted=np.array([Planted()], dtype=object))
+    header = np.asarray(json.dumps({"format": checkpoint.FORMAT}))
+    np.savez(path, header=header, planted=np.array([Planted()], dtype=object))
+    path.write_bytes(signed(path.read_bytes()))
     status, text = ended(evaluate.main, ["run"])
     assert status == 2
     assert "is not a readable checkpoint" in text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxouter import check, plants
-from jaxouter.plants import sources
+from jaxouter.plants import registry
 from tests import lag, logs
 from tests.load import ROOT
 from tests.precision import makes_nan
@@ -16,7 +16,7 @@ TANKS = ROOT / "scripts" / "examples" / "tanks.py"
 
 @pytest.fixture(autouse=True)
 def forgotten():
-    with patch.dict(plants.REGISTRY, lag=lag.make), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY, lag=lag.make), patch.dict(registry.REGISTRATIONS):
         yield
 
 

@@ -22,8 +22,19 @@ from tests import interrupts, lag
 from tests.precision import of_single_draws
 from tests.training.small import small
 
-SMALL = ["--steps", "1600", "--prefill", "640", "--epoch", "480", "--environments", "8", "--replay", "1600"]
-SMALL += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
+SMALL = ["--steps", "1600", "--agent.prefill", "640", "--epoch", "480", "--environments", "8", "--agent.replay", "1600"]
+SMALL += [
+    "--history",
+    "3",
+    "--agent.hidden",
+    "16",
+    "16",
+    "--agent.batch-size",
+    "32",
+    "--agent.updates",
+    "1",
+    "--no-residual",
+]
 SMALL += ["--pretraining.gradient-steps", "0"]
 PLACES = {"pitch/paper": "inside"} | {f"pitch/delay-{name}": "outside" for name in ("5.7", "0.57", "swapped")}
 
@@ -149,7 +160,7 @@ def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
         (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, robust, paper"),
         (["--steps", "-5"], "steps is -5; it must be positive, or 0 with pretraining"),
         (["--seeds", "0"], "seeds is 0; it must be positive"),
-        (["--replay", "100"], "replay is 100; it must hold at least a batch of 256"),
+        (["--agent.replay", "100"], "replay is 100; it must hold at least a batch of 256"),
         (["--no-such-option", "1"], "--no-such-option"),
         (["--steps", "many"], "--steps"),
         (["--out", "."], "exists; choose another --out"),

@@ -18,7 +18,7 @@ import tyro
 
 from jaxouter import cli, compare, evaluate
 from jaxouter.evaluation import scenarios, sweeps
-from jaxouter.evaluation.rivals import NAMES
+from jaxouter.evaluation.baselines import NAMES
 from jaxouter.plants import REGISTRY
 from jaxouter.training.run import Run, write_json
 from tests import interrupts, lag
@@ -71,7 +71,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory, run):
-    """Two seeds of a run, the example and two rivals, on a scenario and a sweep, through the real entry point."""
+    """Two seeds of a run, the example and two baselines, on a scenario and a sweep, through the real entry point."""
     folder = tmp_path_factory.mktemp("compare")
     arguments = [*ASKED, "--run", str(run.path), "--policy", "none", "static", f"{LEAD}:Lead", "--out", "a/result"]
     done = command(*arguments, cwd=folder, cache=folder / "cache")
@@ -84,13 +84,13 @@ def test_comparison_json_has_the_keys_that_the_report_needs(compared):
     content = compared.content
     assert content.keys() == {
         "format", "plant", "y_unit", "time_unit", "family_seed", "date", "machine", "policies", "rows", "statistics",
-        "sweeps", "certificate", "seconds", "command",
+        "sweeps", "stability", "seconds", "command",
     }  # fmt: skip
     assert [content[key] for key in ("format", "plant", "y_unit", "time_unit")] == [1, "pitch", "crad", "s"]
     assert content["machine"].keys() == {"versions", "device", "flags"}
     assert content["command"].startswith("python -m jaxouter.compare pitch --scenario pitch/paper --sweep pitch/gain ")
     assert {name: each["kind"] for name, each in content["policies"].items()} == dict(
-        zip(POLICIES, ("learned", "user", "rival", "rival"), strict=True)
+        zip(POLICIES, ("learned", "user", "baseline", "baseline"), strict=True)
     )
     assert content["policies"]["static"]["settings"]["slope"] == pytest.approx(3.0, rel=0.01)
     assert content["policies"]["static"]["steps"] == 1600
@@ -116,17 +116,17 @@ def test_rows_are_those_of_the_specification(compared):
     assert {label: line["seeds"] for label, line in lines.items()} == dict(zip(POLICIES, (2, 1, 1, 1), strict=True))
 
 
-def test_sweep_and_certificate_are_those_of_the_first_seed(compared):
+def test_sweep_and_stability_are_those_of_the_first_seed(compared):
     gain = compared.content["sweeps"]["pitch/gain"]
     assert list(gain["policies"]) == POLICIES
     for name, swept in gain["policies"].items():
         assert len(swept["values"][0]) == (5 if name == "lead.py:Lead" else 21)
         nominal = swept["mae"][swept["values"][0].index(1.0)]
         assert nominal == pytest.approx(compared.rows(name)[0]["mae"], rel=1e-4)
-    assert set(gain["best_rival"]["policy"]) == {"static"}
-    certificate = compared.content["certificate"]
+    assert set(gain["best_baseline"]["policy"]) == {"static"}
+    stability = compared.content["stability"]
     for name in POLICIES:
-        rows = [row for row in certificate if row["policy"] == name]
+        rows = [row for row in stability if row["policy"] == name]
         assert [row["set_point"] for row in rows] == [-16, -8, 0, 8, 16]
         assert {row["scenario"] for row in rows} == {"pitch/paper"}
         radii = [row["spectral_radius"] for row in rows]
@@ -142,7 +142,7 @@ def test_csv_has_the_same_rows(compared):
 
 def test_figures_are_drawn_and_the_report_holds_them(compared):
     figures = {path.name: path.read_bytes() for path in (compared.out / "figures").iterdir()}
-    assert set(figures) == {"errors.png", "effort.png", "sweep-gain.png", "certificate.png", "pitch-paper.png"}
+    assert set(figures) == {"errors.png", "effort.png", "sweep-gain.png", "stability.png", "pitch-paper.png"}
     page = (compared.out / "report.html").read_text()
     for content in figures.values():
         assert content.startswith(b"\x89PNG\r\n\x1a\n")
@@ -168,17 +168,17 @@ def test_table_is_printed_and_where_the_report_is(compared):
     assert "ratio to the limit" not in compared.stdout  # which nobody asked for
 
 
-def test_rivals_come_from_the_cache_the_second_time(compared, tmp_path, monkeypatch):
-    cached = {path: path.stat().st_mtime_ns for path in (compared.cache / "jaxouter" / "rivals").iterdir()}
+def test_baselines_come_from_the_cache_the_second_time(compared, tmp_path, monkeypatch):
+    cached = {path: path.stat().st_mtime_ns for path in (compared.cache / "jaxouter" / "baselines").iterdir()}
     assert sorted(path.name.rsplit("-", 1)[0] for path in cached) == [
-        "pitch-none", "pitch-none-certify", "pitch-none-meet", "pitch-none-sweep",
-        "pitch-static", "pitch-static-certify", "pitch-static-meet", "pitch-static-sweep",
+        "pitch-none", "pitch-none-evaluate", "pitch-none-stability", "pitch-none-sweep",
+        "pitch-static", "pitch-static-evaluate", "pitch-static-stability", "pitch-static-sweep",
     ]  # fmt: skip
     monkeypatch.setenv("XDG_CACHE_HOME", str(compared.cache))
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     monkeypatch.chdir(tmp_path)
     compare.main([*ASKED, "--policy", "static"])
-    assert {path: path.stat().st_mtime_ns for path in (compared.cache / "jaxouter" / "rivals").iterdir()} == cached
+    assert {path: path.stat().st_mtime_ns for path in (compared.cache / "jaxouter" / "baselines").iterdir()} == cached
     content = json.loads((tmp_path / "runs" / "compare-pitch" / "comparison.json").read_text())
     assert [row["policy"] for row in content["rows"]] == ["none", "static"]
     for row in content["rows"]:
@@ -192,7 +192,7 @@ def test_where_nothing_can_be_drawn_all_else_is_written(compared, tmp_path, caps
     def draw(*_: object) -> None:
         raise RuntimeError("no fonts")
 
-    monkeypatch.setattr(compare.comparison, "draw", draw)
+    monkeypatch.setattr(compare.comparison_figures, "draw", draw)
     page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), compared.content, [], cli.progress())
     assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
     assert "outer loops compared" in page.read_text(encoding="utf-8")
@@ -297,7 +297,7 @@ def test_bad_input_leaves_no_traceback(tmp_path):
 def test_everything_is_the_default(place, monkeypatch):
     plan = compare.check(compare.Options())
     assert (plan.plant, plan.out) == ("pitch", Path("runs/compare-pitch"))
-    assert [c.name for c in plan.contenders] == list(NAMES)
+    assert [c.name for c in plan.entrants] == list(NAMES)
     assert plan.scenarios == tuple(scenarios.catalogue("pitch"))
     assert plan.sweeps == tuple(sweeps.catalogue("pitch"))
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
@@ -306,18 +306,18 @@ def test_everything_is_the_default(place, monkeypatch):
     run.save(0, 1, trainer.start(0, params))
     plan = compare.check(compare.Options(run=(run.path,), policy=("lead.py:Lead",)))
     assert (plan.plant, plan.out) == ("lag", Path("runs/compare-lag"))
-    assert [c.name for c in plan.contenders] == ["learned", "lead.py:Lead", *NAMES]
+    assert [c.name for c in plan.entrants] == ["learned", "lead.py:Lead", *NAMES]
 
 
 def test_inner_loop_alone_is_always_there_and_no_policy_twice(run):
     plan = compare.check(compare.Options(policy=("pi", "clairvoyant", "pi")))
-    assert [(c.name, c.kind) for c in plan.contenders] == [
-        ("none", "rival"), ("pi", "rival"), ("clairvoyant", "preview"),
+    assert [(c.name, c.kind) for c in plan.entrants] == [
+        ("none", "baseline"), ("pi", "baseline"), ("clairvoyant", "preview"),
     ]  # fmt: skip
     plan = compare.check(compare.Options(run=(run.path,), policy=("none",)))
-    assert [(c.name, c.seed) for c in plan.contenders] == [("learned", 1), ("learned", 0), ("none", None)]
+    assert [(c.name, c.seed) for c in plan.entrants] == [("learned", 1), ("learned", 0), ("none", None)]
     plan = compare.check(compare.Options(run=(run.path / "seed-0",), policy=("none",)))
-    assert [c.seed for c in plan.contenders] == [0, None]
+    assert [c.seed for c in plan.entrants] == [0, None]
 
 
 def test_what_is_named_twice_counts_once_and_files_of_one_name_are_told_apart(run, place):
@@ -330,7 +330,7 @@ def test_what_is_named_twice_counts_once_and_files_of_one_name_are_told_apart(ru
         sweep=("pitch/gain", "pitch/gain"),
     )
     plan = compare.check(options)
-    assert [c.name for c in plan.contenders] == ["learned", "lead.py:Lead", "other/lead.py:Lead", "none"]
+    assert [c.name for c in plan.entrants] == ["learned", "lead.py:Lead", "other/lead.py:Lead", "none"]
     assert (plan.scenarios, plan.sweeps) == (("pitch/paper",), ("pitch/gain",))
 
 

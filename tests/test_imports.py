@@ -7,7 +7,7 @@ import pytest
 
 import jaxouter
 
-ORDER = ["plants", "loop", "agents", "training", "evaluation", "deploy"]
+ORDER = ["plants", "loop", "identification", "agents", "tasks", "training", "evaluation", "exports", "runtime"]
 PACKAGE = Path(jaxouter.__file__).parent
 MODULES = sorted(path for folder in ORDER for path in (PACKAGE / folder).glob("**/*.py"))
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from jaxouter import check, compare, plants, train
-from jaxouter.evaluation.rivals import RIVALS
-from jaxouter.loop import identify
-from jaxouter.loop.identify import IdentificationWarning
-from jaxouter.plants import sources
+from jaxouter.evaluation.baselines import BASELINES
+from jaxouter.identification import identify
+from jaxouter.identification.identify import IdentificationWarning
+from jaxouter.plants import registry
 from jaxouter.training.config import from_dict
 from tests import kinds
 from tests.load import ROOT
@@ -31,7 +31,7 @@ def reference(name: str) -> str:
 @pytest.fixture(autouse=True)
 def forgotten():
     """No plant that a test adds stays."""
-    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         yield
 
 
@@ -54,9 +54,9 @@ def test_no_gain_is_shown_where_there_is_none():
 
 def test_static_says_that_it_is_none_also_from_the_cache():
     plant, params = kinds.Integrating()
-    tuned = RIVALS["static"].tune(plant, params, kinds.key(0), 0, lambda text: None)
+    tuned = BASELINES["static"].tune(plant, params, kinds.key(0), 0, lambda text: None)
     with pytest.warns(IdentificationWarning, match="the static prefilter is r~ = r"):
-        _, found = RIVALS["static"].build(plant, tuned)
+        _, found = BASELINES["static"].build(plant, tuned)
     assert (float(found.slope), float(found.offset)) == (1.0, 0.0)
 
 
@@ -94,7 +94,7 @@ def test_every_kind_goes_through_check_train_and_compare(name, tmp_path, monkeyp
     else:
         assert f"DC gain │ none, {REST[name]}" in told
     assert f"dead time │ {30 if name == 'Late' else 0} control steps" in told
-    brief = ["--pretraining.gradient-steps", "200", "--pretraining.batch-size", "32", "--ddpg.hidden", "32", "32"]
+    brief = ["--pretraining.gradient-steps", "200", "--pretraining.batch-size", "32", "--agent.hidden", "32", "32"]
     train.main([reference(name), "--out", "run", *brief])
     captured = capsys.readouterr()
     assert ("the static prefilter is r~ = r" in captured.err) == (name in REST)

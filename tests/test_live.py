@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from jaxouter import live
-from jaxouter.deploy.law import Law
-from jaxouter.loop.log import read
+from jaxouter.exports.spec import ControllerSpec
+from jaxouter.identification.recorded_data import read
 from jaxouter.training.run import Run
 from tests import interrupts
 from tests.load import ROOT
@@ -49,13 +49,13 @@ def test_it_begins_from_nothing_in_real_time(begun):
     assert summary["counts"]["static"] + summary["counts"]["learned"] > 100
     assert summary["missed_deadlines"] == summary["counts"]["late"]
     assert summary["updates"] > 50
-    assert summary["prior"]["slope"] == pytest.approx(1 / 0.7, rel=0.1)
+    assert summary["base"]["slope"] == pytest.approx(1 / 0.7, rel=0.1)
     assert 0.0 < summary["act_us"]["p50"] < summary["act_us"]["p99"]
     last = summary["mae"]["last quarter"]
     assert last["y"] < last["y_passed"]
     assert summary["mae"]["first quarter"]["y_passed"] is None
     assert (folder / "live" / "live.png").read_bytes().startswith(b"\x89PNG")
-    assert Law.load(folder / "live" / "controller.npz").control_step == 0.02
+    assert ControllerSpec.load(folder / "live" / "controller.npz").control_step == 0.02
 
 
 @pytest.mark.slow

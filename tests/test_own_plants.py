@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import evaluate, plants, train
-from jaxouter.plants import sources
+from jaxouter.plants import registry
 from jaxouter.training.run import Run
 from tests import lag
 from tests.load import ROOT
@@ -21,7 +21,7 @@ TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
 @pytest.fixture(autouse=True)
 def forgotten():
     """No plant that a test adds stays."""
-    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         yield
 
 
@@ -32,7 +32,7 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
     kept = json.loads((tmp_path / "run" / "config.json").read_text())
     assert (kept["config"]["plant"], kept["plant"]["reference"]) == ("Tanks", TANKS)
     evaluate.main(["run", "--plant", TANKS, "--scenario", "Tanks/steps", "--episodes", "2"])
-    del plants.REGISTRY["Tanks"], sources.SOURCES["Tanks"]
+    del plants.REGISTRY["Tanks"], registry.REGISTRATIONS["Tanks"]
     with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
         Run.open(tmp_path / "run")
 

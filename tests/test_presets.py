@@ -6,10 +6,10 @@ from unittest.mock import patch
 import pytest
 
 from jaxouter import plants, train
-from jaxouter.evaluation import evaluate, scenarios
+from jaxouter.evaluation import policies, scenarios
 from jaxouter.evaluation.metrics import held
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.plants import sources
+from jaxouter.plants import registry
 from jaxouter.training.run import Run
 from tests.load import ROOT
 
@@ -36,11 +36,11 @@ def test_default_heaters_beat_the_paper_in_comfort(tmp_path):
 
 
 def test_default_on_a_plant_of_ones_own_beats_static_and_pi_on_every_family(tmp_path):
-    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         figures = learned(f"{ROOT}/scripts/examples/tanks.py:Tanks", tmp_path)
-        for rival in (evaluate.rival(name, "Tanks") for name in ("static", "pi")):
-            for identifier, (_, of_rival) in evaluate.evaluate(rival, map(scenarios.get, figures)).items():
-                assert figures[identifier]["mae"] < 0.5 * of_rival["mae"]
+        for baseline in (policies.baseline(name, "Tanks") for name in ("static", "pi")):
+            for identifier, (_, of_baseline) in policies.evaluate(baseline, map(scenarios.get, figures)).items():
+                assert figures[identifier]["mae"] < 0.5 * of_baseline["mae"]
 
 
 @pytest.mark.parametrize("name", ["delay-0.57", "delay-swapped"])

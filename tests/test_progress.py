@@ -7,12 +7,13 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import pytest
 from rich.console import Console
 
 from jaxouter import cli, compare, evaluate, progress, train
-from jaxouter.evaluation import evaluate as evaluation
+from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
 from jaxouter.plants import REGISTRY, host
 from jaxouter.progress import Progress, TimeLeft
@@ -205,7 +206,7 @@ def test_clock(seconds, text):
 
 
 class Heard:
-    """A rehearsal that is so far."""
+    """A pretraining that is so far."""
 
     def __init__(self, done, best=-0.25):
         self.done, self.best = done, best
@@ -213,7 +214,8 @@ class Heard:
 
 def begun(clock, config, plant, flop=(10.0, 1.0)):
     of = Progress(Console(file=io.StringIO(), force_terminal=True, width=80), clock=clock)
-    return of, train.Learning(of, config, plant, "lag/steps", flop)
+    with patch.object(train, "arithmetic", lambda config: flop):
+        return of, train.Learning(of, config, plant, "lag/steps")
 
 
 def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
@@ -264,9 +266,9 @@ def made(mae, **other):
 @pytest.mark.parametrize(("plant", "there"), [("pitch", True), ("lag", False)])
 def test_the_papers_column_is_for_its_plants_alone(plant, there, monkeypatch, capsys):
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
-    met = [scenarios.get(name, 1) for name in scenarios.paper_scenarios(plant)]
-    results = {scenario.id: made(1.0) for scenario in met}
-    train.show(met, {"none": results, "static": results}, {0: results}, {})
+    selected = [scenarios.get(name, 1) for name in scenarios.reported(plant)]
+    results = {scenario.id: made(1.0) for scenario in selected}
+    train.show(selected, {"none": results, "static": results}, {0: results}, {})
     assert ("paper's DRL" in capsys.readouterr().out) == there
 
 
@@ -276,7 +278,7 @@ def row(policy, mae, **other):
 
 
 def test_comparison_explains_only_what_is_there(capsys):
-    policies = {"none": {"kind": "rival"}, "static": {"kind": "rival"}}
+    policies = {"none": {"kind": "baseline"}, "static": {"kind": "baseline"}}
     legends = {"In brackets": "ratio_to_limit", "*: best": "best", "!: outside": "within_limits"}
     for changed in ({}, {"ratio_to_limit": 1.5}, {"best": True}, {"within_limits": False}):
         rows = [row("none", 2.0), row("static", 1.0, **changed)]
@@ -288,7 +290,7 @@ def test_comparison_explains_only_what_is_there(capsys):
 def test_bold_is_explained_where_it_can_be_seen(monkeypatch, capsys):
     out = io.StringIO()
     monkeypatch.setattr(cli, "console", Console(file=out, force_terminal=True, width=80))
-    policies = {"none": {"kind": "rival"}}
+    policies = {"none": {"kind": "baseline"}}
     compare.show({"rows": [row("none", 2.0, best=True)], "policies": policies, "y_unit": "1"})
     assert capsys.readouterr().out == "Bold: best without the model.\n"
     assert "2*" not in STYLE.sub("", out.getvalue())
@@ -338,7 +340,7 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
         return evaluation.Named(name, None, ())
 
     said = []
-    monkeypatch.setattr(evaluate, "rival", slow)
+    monkeypatch.setattr(evaluate, "baseline", slow)
     evaluate.chosen("oracle", "pitch", of)
     identifying, told, tuning = out.getvalue().splitlines()
     assert (identifying, tuning) == ("identifying oracle", "tuning oracle")

@@ -15,15 +15,15 @@ import scipy.sparse as sp
 
 from jaxouter import check, compare, evaluate, plants, train
 from jaxouter.cli import number
+from jaxouter.evaluation.baselines import clairvoyant
+from jaxouter.evaluation.baselines.qp import Condensed, Solver
 from jaxouter.evaluation.metrics import figures_of_merit
-from jaxouter.evaluation.rivals import clairvoyant
-from jaxouter.evaluation.rivals.qp import Condensed, Solver
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import rewards
-from jaxouter.plants import sources
+from jaxouter.plants import registry
 from jaxouter.training.policy import LearnedParams
-from jaxouter.training.pretraining import Teacher
+from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.trainer import build
 from tests import lag
 from tests.training.small import small
@@ -36,7 +36,7 @@ SCALES_WITH_Y = ("mae", "iae", "itae", "steady_state_error", "r_tilde_tv", "retu
 def of_every_unit():
     """The lag is known by its unit."""
     known = {f"lag-{unit:g}": (lambda unit=unit, **changes: lag.make(unit=unit, **changes)) for unit in (1.0, *UNITS)}
-    with patch.dict(plants.REGISTRY, known), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY, known), patch.dict(registry.REGISTRATIONS):
         yield
 
 
@@ -48,7 +48,7 @@ def test_a_plant_that_declares_no_error_scale_has_one_in_its_own_unit():
 
 
 def test_figures_of_merit_go_with_the_unit():
-    """A limit that is just met, up to rounding, and a set-point where y already is, among them."""
+    """A limit that is just selected, up to rounding, and a set-point where y already is, among them."""
 
     def figures(unit: float):
         plant = dataclasses.replace(lag.make(unit=unit)[0], rate_limit=0.5 * unit)
@@ -75,16 +75,14 @@ def test_what_is_learned_from_an_episode_is_the_same():
     def learned(unit: float):
         trainer, params = build(small(f"lag-{unit:g}", history=2))
         state = trainer.fresh(jax.random.key(0), params)
-        teacher = Teacher(trainer.env.plant, trainer.policy, noise=0.02, load=0.1)
+        rollout = DifferentiableRollout(trainer.env.plant, trainer.policy, noise=0.02, load=0.1)
 
         def cost(actor):
-            return teacher.episode(trainer.policy, LearnedParams(actor, state.prior), params.plant, jax.random.key(1))[
-                0
-            ]
+            return rollout.episode(trainer.policy, LearnedParams(actor, state.base), params.plant, jax.random.key(1))[0]
 
         keys = jax.random.split(jax.random.key(2), trainer.config.environments)
-        _, rows, *_ = trainer.vector_step(state, params, jnp.zeros(trainer.config.environments), keys)
-        return jax.jit(jax.value_and_grad(cost))(state.learner.actor), rows[:, 8]
+        _, taken = trainer.environments.step(state, params, jnp.zeros(trainer.config.environments), keys)
+        return jax.jit(jax.value_and_grad(cost))(state.agent.actor), taken.reward
 
     for ours, theirs in zip(jax.tree.leaves(learned(1e-6)), jax.tree.leaves(learned(1.0)), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max())

@@ -1,1 +1,34 @@
-"""Learners: networks, DDPG, exploration noise, replay. They know nothing of plants."""
+"""Agents: what a learner is, those that exist, networks, exploration noise, replay. They know nothing of plants."""
+
+from __future__ import annotations
+
+from jaxouter.agents.agent import Agent, AgentConfig, OffPolicy, OnPolicy
+from jaxouter.agents.ddpg import DDPGConfig
+
+__all__ = ["AGENTS", "Agent", "AgentConfig", "OffPolicy", "OnPolicy", "name_of", "resolve"]
+
+AGENTS: dict[str, type[AgentConfig]] = {"ddpg": DDPGConfig}
+"""Settings of every known learner, by its name."""
+
+
+def resolve(name: str) -> type[AgentConfig]:
+    """The settings of the agent called `name`.
+
+    Raises:
+        ValueError: there is no such agent; lists those that exist.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"there is no agent {name!r}; the agents are: {', '.join(AGENTS)}, and FILE.py:CLASS")
+    return AGENTS[name]
+
+
+def name_of(config: AgentConfig) -> str:
+    """The name under which the settings are registered.
+
+    Raises:
+        ValueError: they are not.
+    """
+    for name, kind in AGENTS.items():
+        if kind is type(config):
+            return name
+    raise ValueError(f"{type(config).__name__} is not in jaxouter.agents.AGENTS; add it there, under a name")

@@ -5,7 +5,7 @@ One transition is unbatched in the small functions; `update` vmaps them over a b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, cast
 
 import chex
@@ -14,11 +14,13 @@ import jax.numpy as jnp
 import optax
 
 from jaxouter.agents.adam import adam
+from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
 from jaxouter.agents.networks import Actor, Critic
+from jaxouter.agents.noise import ornstein_uhlenbeck
 
 
 @dataclass(frozen=True)
-class DDPGConfig:
+class DDPGConfig(AgentConfig):
     """Settings of the learner; the defaults are the paper's (and Lillicrap's where the paper is silent)."""
 
     hidden: tuple[int, ...] = (400, 300)
@@ -53,41 +55,65 @@ class DDPGConfig:
     """TD3: standard deviation of the noise on the target action."""
     target_noise_clip: float = 0.5
     """TD3: largest such noise."""
+    updates: int = 1
+    """Updates after each step of all environments; updates / environments is the update-to-data ratio."""
+    prefill: int = 1_000
+    """Environment steps with random actions, each held a while, before the first update."""
+    replay: int = 1_000_000
+    """Environment steps that the replay holds."""
+    noise_theta: float = 0.15
+    """Rate of return of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
+    noise_sigma: tuple[float, float] = (0.2, 0.2)
+    """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
+    noise_end: float = 1.0
+    """Factor on the volatility at the end of training, reached linearly."""
+
+    @property
+    def data(self) -> OffPolicy:
+        """Transitions from a replay."""
+        return OffPolicy(self.batch_size, self.n_step, self.discount, self.updates, self.prefill, self.replay)
+
+    def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> DDPG:
+        """The learner."""
+        return DDPG(self, obs_size, total_updates=total_updates, axis=axis)
 
     def check(self) -> None:
         """Raises ValueError, naming field, value and what is allowed."""
-        positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay")
+        positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay", "updates")
         not_negative = ("critic_l2", "saturation_penalty", "actor_from", "target_noise", "target_noise_clip")
         for field in positive:
             if not getattr(self, field) > 0:
-                raise ValueError(f"ddpg.{field} is {getattr(self, field)}; it must be positive")
+                raise ValueError(f"agent.{field} is {getattr(self, field)}; it must be positive")
         for field in not_negative:
             if not getattr(self, field) >= 0:
-                raise ValueError(f"ddpg.{field} is {getattr(self, field)}; it must not be negative")
+                raise ValueError(f"agent.{field} is {getattr(self, field)}; it must not be negative")
         if not 0 <= self.discount < 1:
-            raise ValueError(f"ddpg.discount is {self.discount}; it must lie in [0, 1)")
-        if not 0 < self.polyak <= 1:
-            raise ValueError(f"ddpg.polyak is {self.polyak}; it must lie in (0, 1]")
+            raise ValueError(f"agent.discount is {self.discount}; it must lie in [0, 1)")
+        for field in ("polyak", "noise_theta"):
+            if not 0 < getattr(self, field) <= 1:
+                raise ValueError(f"agent.{field} is {getattr(self, field)}; it must lie in (0, 1]")
         if self.critics not in (1, 2) or self.rate_decay not in ("constant", "cosine"):
             raise ValueError(
-                f"ddpg.critics is {self.critics} and ddpg.rate_decay is {self.rate_decay!r}; "
+                f"agent.critics is {self.critics} and agent.rate_decay is {self.rate_decay!r}; "
                 "they must be 1 or 2, and constant or cosine"
             )
+        if min(self.noise_sigma) <= 0 or self.noise_end < 0:
+            raise ValueError(
+                f"agent.noise_sigma is {self.noise_sigma} and agent.noise_end is {self.noise_end}; "
+                "they must be positive and not negative"
+            )
         if len(self.hidden) < 2 or min(self.hidden) < 1:
-            raise ValueError(f"ddpg.hidden is {self.hidden}; it must be at least two positive widths")
+            raise ValueError(f"agent.hidden is {self.hidden}; it must be at least two positive widths")
 
 
-class Batch(NamedTuple):
-    """Transitions (B, ...)."""
+class Noise(NamedTuple):
+    """What exploration remembers, of one environment or of all."""
 
-    obs: jax.Array  # (B, n)
-    action: jax.Array  # (B, m), in [-1, 1]
-    reward: jax.Array  # (B,), discounted sum over the n steps
-    discount: jax.Array  # (B,), of the bootstrapped value; 0 where terminated
-    next_obs: jax.Array  # (B, n)
+    x: jax.Array  # Ornstein-Uhlenbeck process
+    sigma: jax.Array  # its volatility at the beginning of the training
 
 
-class LearnerState(NamedTuple):
+class DDPGState(NamedTuple):
     """Everything that learning changes."""
 
     actor: Any
@@ -97,26 +123,6 @@ class LearnerState(NamedTuple):
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
     updates: jax.Array  # int32
-
-
-def n_step_return(
-    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return of up to n consecutive steps (n,), ended by the first termination or truncation.
-
-    A truncated step is bootstrapped from its final observation, a terminated one (also if truncated too) is not.
-
-    Returns:
-        The discounted sum of rewards, the discount of the bootstrapped value (0 where terminated), and the index of
-        the last step used.
-    """
-    chex.assert_rank([reward, terminated, truncated], 1)
-    done = terminated | truncated
-    running = jnp.cumprod(jnp.concatenate([jnp.ones(1, bool), ~done[:-1]]).astype(reward.dtype))
-    powers = discount ** jnp.arange(reward.shape[0], dtype=reward.dtype)
-    last = jnp.sum(running).astype(jnp.int32) - 1
-    bootstrap = powers[last] * discount * jnp.where(terminated[last], 0.0, 1.0)
-    return jnp.sum(running * powers * reward), bootstrap, last
 
 
 def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
@@ -154,7 +160,12 @@ class DDPG:
     """Mapped axis over which gradients are averaged: each of its members updates on its part of the batch."""
 
     @property
-    def actor(self) -> Actor:
+    def data(self) -> OffPolicy:
+        """What it learns from."""
+        return self.config.data
+
+    @property
+    def network(self) -> Actor:
         """The actor network."""
         return Actor(self.config.hidden, self.action_size)
 
@@ -193,13 +204,17 @@ class DDPG:
 
         return optax.chain(optax.add_decayed_weights(self.config.critic_l2, kernels), plain)
 
-    def init(self, key: chex.PRNGKey) -> LearnerState:
+    def init(self, key: chex.PRNGKey) -> DDPGState:
         """Random networks, targets equal to them."""
         key_actor, *key_critics = jax.random.split(key, 1 + self.config.critics)
         obs, action = jnp.zeros(self.obs_size), jnp.zeros(self.action_size)
-        actor = self.actor.init(key_actor, obs)
+        actor = self.network.init(key_actor, obs)
         critics = tuple(self.critic.init(k, obs, action) for k in key_critics)
-        return LearnerState(
+        return self._begin(actor, critics)
+
+    def _begin(self, actor: Any, critics: tuple[Any, ...]) -> DDPGState:
+        """With targets, optimisers and counters anew."""
+        return DDPGState(
             actor=actor,
             critics=critics,
             target_actor=jax.tree.map(jnp.copy, actor),  # copies: the state is donated, and no buffer twice
@@ -209,21 +224,62 @@ class DDPG:
             updates=jnp.zeros((), jnp.int32),
         )
 
+    def restarted(self, state: DDPGState) -> DDPGState:
+        """The same networks, with targets, optimisers and counters anew."""
+        return self._begin(state.actor, state.critics)
+
+    def actor(self, state: DDPGState) -> Any:
+        """Parameters of the actor network."""
+        return state.actor
+
+    def with_actor(self, state: DDPGState, actor: Any) -> DDPGState:
+        """The state with another actor, its target too."""
+        return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
+
+    def endless(self, warm_up: int) -> DDPG:
+        """The same learner for a loop without end, whose actor stays as it is for so many updates."""
+        config = replace(self.config, n_step=1, rate_decay="constant", actor_from=warm_up)
+        return DDPG(config, self.obs_size, self.action_size)
+
+    def noise(self, environments: int) -> Noise:
+        """Zero, with volatilities from the first environment to the last."""
+        low, high = self.config.noise_sigma
+        sigma = jnp.geomspace(low, high, environments) if environments > 1 else jnp.full(1, high)
+        return Noise(jnp.zeros(environments), sigma)
+
+    def explore(
+        self, state: DDPGState, noise: Noise, obs: jax.Array, normal: jax.Array, first: jax.Array, progress: jax.Array
+    ) -> tuple[jax.Array, Noise, tuple[()]]:
+        """mu(s) and Ornstein-Uhlenbeck noise, which begins anew with each episode; see `Agent.explore`."""
+        sigma = noise.sigma * (1.0 + (self.config.noise_end - 1.0) * progress)
+        x = ornstein_uhlenbeck(jnp.where(first, 0.0, noise.x), normal[0], self.config.noise_theta, sigma)
+        return jnp.clip(self.act(state.actor, obs) + x[None], -1.0, 1.0), noise._replace(x=x), ()
+
     def act(self, actor: Any, obs: jax.Array) -> jax.Array:
         """mu(s): obs (..., n) -> action (..., m) in [-1, 1]."""
         return jnp.tanh(self.before_tanh(actor, obs))
 
     def before_tanh(self, actor: Any, obs: jax.Array) -> jax.Array:
         """The actor's output before its tanh: obs (..., n) -> (..., m)."""
-        return cast(jax.Array, self.actor.apply(actor, obs))
+        return cast(jax.Array, self.network.apply(actor, obs))
+
+    def value(self, state: DDPGState, obs: jax.Array) -> jax.Array:
+        """Q(s, mu(s)) of the first critic: obs (..., n) -> (...)."""
+        return cast(jax.Array, self.critic.apply(state.critics[0], obs, self.act(state.actor, obs)))
 
     def values(self, critics: tuple[Any, ...], obs: jax.Array, action: jax.Array) -> jax.Array:
         """Q of each critic: (B, n), (B, m) -> (B, critics)."""
         return jnp.stack([cast(jax.Array, self.critic.apply(critic, obs, action)) for critic in critics], -1)
 
+    def diagnose(self, state: DDPGState, batch: Transitions, key: chex.PRNGKey) -> dict[str, jax.Array]:
+        """Norms of the gradients of critic and actor on a batch."""
+        about_to_move = state._replace(updates=jnp.full_like(state.updates, self.config.policy_delay - 1))
+        _, found = self.update(about_to_move, batch, key, norms=True)
+        return {name: found[name] for name in ("critic_gradient", "actor_gradient")}
+
     def update(
-        self, state: LearnerState, batch: Batch, key: chex.PRNGKey, norms: bool = False
-    ) -> tuple[LearnerState, dict[str, Any]]:
+        self, state: DDPGState, batch: Transitions, key: chex.PRNGKey, norms: bool = False
+    ) -> tuple[DDPGState, dict[str, Any]]:
         """One gradient step of critic, actor and targets (paper eq. 2 to 5, algorithm 1).
 
         Args:
@@ -260,7 +316,7 @@ class DDPG:
         )
         state = state._replace(critics=critics, critic_optimiser=critic_optimiser, updates=state.updates + 1)
 
-        def move_actor(state: LearnerState) -> tuple[LearnerState, tuple[Any, ...]]:
+        def move_actor(state: DDPGState) -> tuple[DDPGState, tuple[Any, ...]]:
             def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
                 before_tanh = self.before_tanh(actor, batch.obs)
                 action = jnp.tanh(before_tanh)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 
 
 def dense(features: int, fan_in: int, limit: float | None = None, **rest: Any) -> nn.Dense:
@@ -32,6 +33,11 @@ class Actor(nn.Module):
         for features in self.hidden:
             x = nn.relu(dense(features, x.shape[-1])(x))
         return dense(self.actions, x.shape[-1], 3e-3)(x)
+
+
+def act(hidden: tuple[int, ...], actor: Any, obs: jax.Array) -> jax.Array:
+    """Action of an actor of one action: its tanh, obs (..., n) -> (..., 1) in [-1, 1]."""
+    return jnp.tanh(cast(jax.Array, Actor(hidden, 1).apply(actor, obs)))
 
 
 class Critic(nn.Module):

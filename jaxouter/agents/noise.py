@@ -13,6 +13,6 @@ def ornstein_uhlenbeck(x: jax.Array, normal: jax.Array, theta: float, sigma: jax
         normal: standard normal of the same shape.
         theta, sigma: rate of return and volatility (paper: 0.15, 0.2).
 
-    Source: Lillicrap et al. 2015, supplement; spec section 5 and paper section III-A.
+    Source: Lillicrap et al. 2015, supplement; paper section III-A.
     """
     return x - theta * x + sigma * normal

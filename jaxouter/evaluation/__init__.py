@@ -1,1 +1,1 @@
-"""Evaluation: scenarios that training never sees, roll-outs, figures of merit, rivals, sweeps, certificate, report."""
+"""Evaluation: scenarios that training never sees, roll-outs, figures of merit, baselines, sweeps, stability, report."""

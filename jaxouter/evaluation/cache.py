@@ -21,11 +21,11 @@ import numpy as np
 import platformdirs
 
 import jaxouter
-from jaxouter.plants import sources
+from jaxouter.plants import registry
 
 PACKAGE = Path(jaxouter.__file__).parent
-SOURCES = ("plants", "loop", "agents", "training", "evaluation/rivals")
-FILES = ("metrics.py", "rollout.py", "scenarios.py", "sweeps.py", "certificate.py", "board.py", "cache.py")
+FOLDERS = ("plants", "loop", "identification", "agents", "training", "evaluation/baselines")
+FILES = ("metrics.py", "rollout.py", "scenarios.py", "sweeps.py", "stability.py", "jobs.py", "cache.py")
 
 
 class Tuned(NamedTuple):
@@ -43,7 +43,7 @@ def folder() -> Path | None:
         path = Path(platformdirs.user_cache_dir("jaxouter", appauthor=False))
     except RuntimeError:
         return None
-    return path if path.is_absolute() else None  # "~/.cache" of earlier versions
+    return path if path.is_absolute() else None
 
 
 def usable() -> Path | None:
@@ -71,7 +71,7 @@ def _unusable(why: str) -> None:
 @lru_cache(maxsize=1)
 def code() -> str:
     """Hash of all source that results depend on, and of the version of JAX."""
-    paths = [path for part in SOURCES for path in sorted((PACKAGE / part).glob("*.py"))]
+    paths = [path for part in FOLDERS for path in sorted((PACKAGE / part).glob("*.py"))]
     paths += [PACKAGE / "evaluation" / name for name in FILES]
     return hashlib.sha256(b"\0".join([jax.__version__.encode(), *(path.read_bytes() for path in paths)])).hexdigest()
 
@@ -84,9 +84,9 @@ def cached(name: str, key: Mapping[str, Any], make: Callable[[], Tuned]) -> Tune
         key: JSON values that the result depends on, beside the code.
         make: makes it.
     """
-    own = {name: repr(source) for name, source in sources.SOURCES.items()}
+    own = {name: repr(known) for name, known in registry.REGISTRATIONS.items()}
     text = json.dumps({"code": code(), **key} | ({"plants": own} if own else {}), sort_keys=True)
-    kept = Path("rivals") / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    kept = Path("baselines") / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     if (there := folder()) is not None:
         with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # absent or damaged: made again
             return _read(there / kept)

@@ -13,7 +13,7 @@ from jaxouter.evaluation.drawing import Axes, Figure, LogLocator, NullFormatter
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.loop.trust import COHERENT, Report
+from jaxouter.identification.validation import COHERENT, Report
 from jaxouter.plants import Plant
 
 INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"

@@ -18,7 +18,7 @@ from jaxouter.evaluation.statistics import Line, lines
 KIND_NAMES = {
     "learned": "learned",
     "user": "user's",
-    "rival": "rival",
+    "baseline": "baseline",
     "limit": "limit, not ranked",
     "preview": "with preview, not ranked",
 }
@@ -44,7 +44,7 @@ TERMS = (
     ("limit", "a policy with the same network and observation, trained by back-propagation through the simulator"),
     ("with preview", "the least error of any r̃ within the bounds, knowing plant, state, noise and the whole reference"),
     ("outside the limits", "the limit of y, or of its change, is left in more than 0.1 % of the steps"),
-    ("rank", "by MAE, among the learned, the users' and the rival policies that keep the limits and do not diverge"),
+    ("rank", "by MAE, among the learned, the users' and the baseline policies that keep the limits and do not diverge"),
 )
 
 
@@ -174,7 +174,7 @@ def _count(n: int, noun: str) -> str:
 
 
 def _table(comparison: Mapping[str, Any], every: list[Line]) -> list[list[TableLine]]:
-    """The table of errors: learned and users' policies, rivals, and those that are not ranked."""
+    """The table of errors: learned and users' policies, baselines, and those that are not ranked."""
     names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
     groups: list[list[TableLine]] = [[], [], []]
     for line in every:
@@ -182,7 +182,7 @@ def _table(comparison: Mapping[str, Any], every: list[Line]) -> list[list[TableL
         remarks = {"limit": "the limit", "preview": "with preview"}
         remark = remarks.get(line.kind, f"{found['seeds']} seeds" if found["seeds"] > 1 else "")
         cells = [_cell(line, name) for name in names]
-        where = {"learned": 0, "user": 0, "rival": 1}.get(line.kind, 2)
+        where = {"learned": 0, "user": 0, "baseline": 1}.get(line.kind, 2)
         groups[where].append(TableLine(line.label, line.kind, remark, cells, found["mean_rank"]))
     return groups
 
@@ -203,16 +203,16 @@ def _cell(line: Line, scenario: str) -> Cell:
     return Cell(mae, limit, out, "best" if best else "out" if out else "", said)
 
 
-def _radii(certificate: list[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _radii(stability: list[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Largest spectral radius by policy and scenario, and numbered notes."""
-    if not certificate:
+    if not stability:
         return None
-    policies, names = (list(dict.fromkeys(row[key] for row in certificate)) for key in ("policy", "scenario"))
-    notes = list(dict.fromkeys(row["note"] for row in certificate if row["note"]))
+    policies, names = (list(dict.fromkeys(row[key] for row in stability)) for key in ("policy", "scenario"))
+    notes = list(dict.fromkeys(row["note"] for row in stability if row["note"]))
     cells: dict[str, list[dict[str, Any]]] = {}
     for policy in policies:
         for name in names:
-            rows = [row for row in certificate if (row["policy"], row["scenario"]) == (policy, name)]
+            rows = [row for row in stability if (row["policy"], row["scenario"]) == (policy, name)]
             radius = max((row["spectral_radius"] for row in rows if row["spectral_radius"] is not None), default=None)
             own = sorted({notes.index(row["note"]) + 1 for row in rows if row["note"]})
             cells.setdefault(policy, []).append(
@@ -247,7 +247,7 @@ def _contents(comparison: Mapping[str, Any], figures: Mapping[str, Path]) -> lis
         "responses": "Time responses",
         "effort": "Effort" if "effort" in figures else "",
         "sweeps": "Sweeps" if any(name.startswith("sweep ") for name in figures) else "",
-        "certificate": "Stability" if comparison["certificate"] else "",
+        "stability": "Stability" if comparison["stability"] else "",
         "policies": "Policies",
         "definitions": "Definitions",
         "made": "How this was made",
@@ -263,7 +263,7 @@ def write(
     Args:
         path: HTML file.
         comparison: the content of comparison.json.
-        figures: PNGs by the ids of `jaxouter.evaluation.comparison.draw`; another key is a caption.
+        figures: PNGs by the ids of `jaxouter.evaluation.comparison_figures.draw`; another key is a caption.
         responses: PNG of the time responses, by scenario.
 
     Returns:
@@ -279,7 +279,7 @@ def write(
     environment.filters |= {"figure": figure, "ratio": ratio, "short": short, "setting": setting}
     every = lines(comparison["rows"], comparison["policies"])
     names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
-    known = {name: figures.get(name) for name in ("errors", "effort", "certificate")}
+    known = {name: figures.get(name) for name in ("errors", "effort", "stability")}
     page = environment.get_template("report.html.j2").render(
         plant=comparison["plant"],
         unit=symbol(comparison["y_unit"]),
@@ -298,7 +298,7 @@ def write(
         table=_table(comparison, every),
         merits=merits(comparison["y_unit"], comparison["time_unit"]),
         terms=TERMS,
-        radii=_radii(comparison["certificate"]),
+        radii=_radii(comparison["stability"]),
         contents=_contents(comparison, figures),
         figures={name: _image(image) if image else None for name, image in known.items()},
         sweeps=[(key.removeprefix("sweep "), _image(png)) for key, png in figures.items() if key.startswith("sweep ")],

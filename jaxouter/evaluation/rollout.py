@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.loop import rewards, sensor
+from jaxouter.loop import closed_loop, rewards, sensor
+from jaxouter.loop.closed_loop import LoopState
 from jaxouter.loop.policy import Policy
 from jaxouter.loop.rewards import RewardParams
 from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant, host
+from jaxouter.plants.base import parameters
 
 
 class Traces(NamedTuple):
@@ -31,15 +33,6 @@ class Traces(NamedTuple):
     each_outside: Any  # share of the single outputs outside the limits; nan where the plant has no members
     each_excess: Any  # by how much the worst of them is
     members: Any  # (episodes, T, n) where asked for, else None
-
-
-class _Run(NamedTuple):
-    """State of a roll-out at t_k."""
-
-    plant: Any
-    y: jax.Array
-    y_seen: jax.Array
-    r_tilde: jax.Array
 
 
 class _Inputs(NamedTuple):
@@ -58,14 +51,6 @@ def _axes(inputs: _Inputs) -> Any:
     return _Inputs(*axes)
 
 
-def parameters(params: Any, change: tuple[jax.Array, Any] | None, k: jax.Array) -> Any:
-    """The plant's parameters at step k, when from step `change[0]` on they are `change[1]`."""
-    if change is None:
-        return params
-    at, after = change
-    return jax.tree.map(lambda a, b: jnp.where(k >= at, a, b), after, params)
-
-
 def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike) -> jax.Array:
     """By how much y (any shape) is outside the plant's limits; at most 0 where inside."""
     y, y_before = jnp.asarray(y), jnp.asarray(y_before)
@@ -77,31 +62,40 @@ def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike
     return over
 
 
-def _begin(plant: Plant, inputs: _Inputs, key: chex.PRNGKey) -> _Run:
+def _begin(plant: Plant, inputs: _Inputs, key: chex.PRNGKey) -> LoopState:
     key_start, key_sensor = jax.random.split(key)
-    state = plant.init(key_start, inputs.params)
-    y = plant.output(inputs.params, state)
-    return _Run(state, y, sensor.measure(inputs.sensor, key_sensor, y, y), jnp.clip(y, *plant.r_tilde_bounds))
+    measure = partial(sensor.measure, inputs.sensor, key_sensor)
+    return closed_loop.begin(plant, inputs.params, plant.init(key_start, inputs.params), measure)
+
+
+def _diverged(r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, tuple[()]]:
+    """A policy that failed has diverged at once, even where a dead time would hide it until the episode is over."""
+    return jnp.where(jnp.isnan(r_tilde), jnp.nan, y), ()
 
 
 def _advance(
-    plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: jax.Array, r: jax.Array, r_tilde: jax.Array, key: Any
-) -> tuple[_Run, dict[str, jax.Array]]:
-    """One control step of the plant, r~ clipped to its bounds."""
+    plant: Plant,
+    record: bool,
+    inputs: _Inputs,
+    loop: LoopState,
+    k: jax.Array,
+    r: jax.Array,
+    r_tilde: jax.Array,
+    key: chex.PRNGKey,
+) -> tuple[LoopState, dict[str, jax.Array]]:
+    """One control step of the loop under r~, and what is recorded of it."""
     key_plant, key_sensor = jax.random.split(key)
-    params = parameters(inputs.params, inputs.change, k)
-    r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
-    state = plant.step(params, run.plant, r_tilde, key_plant)
-    # A policy that failed has diverged at once, even where a dead time would hide it until the episode is over.
-    y = jnp.where(jnp.isnan(r_tilde), jnp.nan, plant.output(params, state))
-    out = dict(y=y, r_tilde=r_tilde, reward=rewards.reward(inputs.reward, r, y, run.y, r_tilde, run.r_tilde))
+    params, measure = parameters(inputs.params, inputs.change, k), partial(sensor.measure, inputs.sensor, key_sensor)
+    after, reward, _ = closed_loop.advance(
+        plant, params, inputs.reward, loop, r, r_tilde, key_plant, measure, _diverged
+    )
+    out = dict(y=after.y, r_tilde=after.r_tilde, reward=reward)
     if plant.members is not None:
-        members = plant.members(params, state)
-        over = excess(plant, members, plant.members(params, run.plant))
+        members = plant.members(params, after.plant)
+        over = excess(plant, members, plant.members(params, loop.plant))
         out |= dict(each_outside=jnp.mean(jnp.where(over > 0, 1.0, 0.0)), each_excess=jnp.max(over))
         out |= dict(members=members) if record else {}
-    y_seen = sensor.measure(inputs.sensor, key_sensor, y, run.y_seen)
-    return _Run(state, y, y_seen, r_tilde), out
+    return after, out
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
@@ -119,19 +113,19 @@ def _rollout(
         policy_params: Any, inputs: _Inputs, r: jax.Array, key: chex.PRNGKey
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         key_begin, key_policy, key_run = jax.random.split(key, 3)
-        run = _begin(plant, inputs, key_begin)
+        begun = _begin(plant, inputs, key_begin)
 
-        def step(carry: tuple[_Run, Any], x: Any) -> tuple[tuple[_Run, Any], dict[str, jax.Array]]:
-            run, memory = carry
+        def step(carry: tuple[LoopState, Any], x: Any) -> tuple[tuple[LoopState, Any], dict[str, jax.Array]]:
+            loop, memory = carry
             k, r_k, key, key_act = x
-            memory, r_tilde = policy.act(policy_params, memory, r_k, run.y_seen, key_act)
-            run, out = _advance(plant, record, inputs, run, k, r_k, r_tilde, key)
-            return (run, memory), out
+            memory, r_tilde = policy.act(policy_params, memory, r_k, loop.y_seen, key_act)
+            loop, out = _advance(plant, record, inputs, loop, k, r_k, r_tilde, key)
+            return (loop, memory), out
 
         steps = r.shape[0]
         xs = (jnp.arange(steps), r, jax.random.split(key_run, steps), jax.random.split(key_policy, steps))
-        memory = policy.init(policy_params, r[0], run.y_seen)
-        return run.y, jax.lax.scan(step, (run, memory), xs)[1]
+        memory = policy.init(policy_params, r[0], begun.y_seen)
+        return begun.y, jax.lax.scan(step, (begun, memory), xs)[1]
 
     return jax.vmap(episode, (0 if per_episode else None, _axes(inputs), 0, 0))(policy_params, inputs, r, keys)
 
@@ -201,13 +195,13 @@ def outputs(policy: Policy, policy_params: Any, scenario: Scenario) -> jax.Array
 
 
 @partial(jax.jit, static_argnums=0)
-def _begin_all(plant: Plant, inputs: _Inputs, keys: Any) -> _Run:
+def _begin_all(plant: Plant, inputs: _Inputs, keys: Any) -> LoopState:
     return jax.vmap(partial(_begin, plant), (_axes(inputs), 0))(inputs, keys)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _advance_all(
-    plant: Plant, record: bool, inputs: _Inputs, run: _Run, k: Any, r: Any, r_tilde: Any, keys: Any
+    plant: Plant, record: bool, inputs: _Inputs, run: LoopState, k: Any, r: Any, r_tilde: Any, keys: Any
 ) -> Any:
     step = partial(_advance, plant, record)
     return jax.vmap(step, (_axes(inputs), 0, None, 0, 0, 0))(inputs, run, k, r[:, k], r_tilde, keys[:, k])

@@ -1,8 +1,8 @@
-"""The evaluation scenarios (spec section 6). None of them is ever trained on."""
+"""The evaluation scenarios: those that tasks declare, and families of references. None is ever trained on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -10,24 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxouter import tasks
 from jaxouter.loop import sensor as sensors
 from jaxouter.loop.references import FAMILIES
 from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant, Ranges, make
-from jaxouter.plants.pitch import W_PRINTED
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
 NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
 Place = Literal["inside", "edge", "outside"]
-OF_THE_START = ("x0_mean", "x0_spread", "weights")
 ROUNDING = 1e-5  # of a number of the plant, by which it may lie outside its range
-PITCH_SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
-PITCH_MAX_DELAY = (
-    5.7  # s; one length of the delay lines for all scenarios with delays of u, which so share a compilation
-)
-HEATERS_SETPOINTS = (15.0, 20.0, 17.0, 22.0)  # degC, 50 h each
 
 
 @dataclass(frozen=True)
@@ -64,69 +58,40 @@ def _repeat(params: Any, episodes: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (episodes, *leaf.shape)), params)
 
 
-def _pitch(
-    name: str,
-    episodes: int = 1,
-    change: dict[str, Any] | None = None,
-    rest: dict[str, Any] | None = None,
-    **overrides: Any,
-) -> Builder:
+def _declared(plant: str, name: str, spec: tasks.Scenario) -> Builder:
+    """The scenario of that name that the plant's task declares."""
+
     def build(wanted: int | None) -> Scenario:
-        n = wanted or episodes
-        lines = {"max_delay": PITCH_MAX_DELAY} if "d1" in overrides else {}
-        plant, params = make("pitch", **overrides)
+        n = wanted or spec.episodes
+        made, params = make(plant, **spec.set)
         changed = None
-        if change is not None:
-            after = make("pitch", **overrides, **change)[1].replace(**lines)
-            changed = (plant.episode_steps // 2, _repeat(after, n))
-        r = jnp.full(plant.episode_steps, PITCH_SETPOINT)
-        return _scenario(name, plant, params.replace(**lines), r, n, change=changed, **(rest or {}))
+        if spec.change:
+            after = make(plant, **{**spec.set, **spec.change})[1]
+            changed = (made.episode_steps // 2, spec.adapt(_repeat(after, n)))
+        r = jnp.repeat(jnp.asarray(spec.reference, float), made.episode_steps // len(spec.reference))
+        r = jnp.pad(r, (0, made.episode_steps - r.size), mode="edge")
+        scenario = _scenario(name, made, params, r, n, change=changed, paper=spec.paper)
+        return replace(
+            scenario,
+            params=spec.adapt(scenario.params),
+            stable_alone=spec.stable_alone,
+            sensor=sensors.params(noise=spec.noise),
+        )
 
     return build
-
-
-def _heaters(
-    name: str, change: dict[str, Any] | None = None, rest: dict[str, Any] | None = None, **overrides: Any
-) -> Builder:
-    def build(wanted: int | None) -> Scenario:
-        n = wanted or NOISE_SEEDS
-        plant, params = make("heaters", **overrides)
-        changed = None
-        if change is not None:
-            changed = (plant.episode_steps // 2, _repeat(make("heaters", **(overrides | change))[1], n))
-        r = jnp.repeat(jnp.asarray(HEATERS_SETPOINTS), plant.episode_steps // len(HEATERS_SETPOINTS))
-        return _scenario(name, plant, params, r, n, change=changed, **(rest or {}))
-
-    return build
-
-
-def _mixed_stock(wanted: int | None) -> Scenario:
-    """paper-4 with Ca and Ua uniform within 30 % from house to house, another stock in each episode."""
-    base = _heaters("mixed-stock")(wanted)
-    shape = base.params.weights.shape
-    key_Ca, key_Ua = jax.random.split(jax.random.key(1))
-    house = base.params.house.replace(
-        Ca=base.params.house.Ca[:, None] * jax.random.uniform(key_Ca, shape, float, 0.7, 1.3),
-        Ua=base.params.house.Ua[:, None] * jax.random.uniform(key_Ua, shape, float, 0.7, 1.3),
-    )
-    return replace(base, params=base.params.replace(house=house))
 
 
 def _family(name: str, kind: str, family_seed: int) -> Builder:
-    """A family of references drawn from the seed; heaters: 1000 houses whose mean start is drawn too."""
+    """A family of references drawn from the seed, on the plant as its task has it for families."""
 
     def build(wanted: int | None) -> Scenario:
-        n = wanted or FAMILY_MEMBERS
-        overrides: dict[str, Any] = {"n": 1000} if name == "heaters" else {}
-        plant, params = make(name, **overrides)
+        n, families = wanted or FAMILY_MEMBERS, tasks.of(name).families
+        plant, params = make(name, **families.set)
         steps = plant.episode_steps if kind == "steps" else plant.family_steps
         keys = jax.random.split(jax.random.fold_in(jax.random.key(family_seed), list(FAMILIES).index(kind)), n)
         r = jax.vmap(lambda key: FAMILIES[kind](key, steps, *plant.evaluation_range))(keys)
         scenario = _scenario(kind, plant, params, r, n, segments=kind not in ("ramps", "sines"))
-        if name == "heaters":
-            start = jax.random.uniform(jax.random.fold_in(keys[0], 1), (n,), float, *plant.setpoint_range)
-            scenario = replace(scenario, params=scenario.params.replace(x0_mean=start))
-        return scenario
+        return replace(scenario, params=families.adapt(scenario.params, jax.random.fold_in(keys[0], 1), n))
 
     return build
 
@@ -134,32 +99,10 @@ def _family(name: str, kind: str, family_seed: int) -> Builder:
 def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Builder]:
     """Every scenario of a plant: id -> function of the number of episodes (None: its own number).
 
-    A plant without scenarios of its own has the families that it declares.
+    They are those that its task declares, and the families that the plant does.
     """
     plant, _ = make(name)
-    unstable = {"stable_alone": False}
-    delays = {"paper": (10.13, 2.46)}  # the paper's one delayed case; no reading of it gives its 10.13 exactly
-    noisy_pitch, noisy_heaters = ({"sensor": sensors.params(noise=noise)} for noise in (0.2, 0.1))
-    own = {
-        "pitch": {
-            "paper": _pitch("paper", rest={"paper": (10.91, 3.90)}),
-            "delay-0.57": _pitch("delay-0.57", d1=0.57, d2=0.57, rest=delays),
-            "delay-5.7": _pitch("delay-5.7", d1=5.7, d2=0.57, rest=delays | unstable),
-            "delay-swapped": _pitch("delay-swapped", d1=0.57, d2=5.7, rest=delays | unstable),
-            "uncertainty": _pitch("uncertainty", W=W_PRINTED, rest=unstable),
-            "load": _pitch("load", change={"disturbance": 2.0}),
-            "noise": _pitch("noise", NOISE_SEEDS, rest=noisy_pitch),
-        },
-        "heaters": {
-            "paper-4": _heaters("paper-4", rest={"paper": (15.62, 1.17)}),
-            "paper-1000": _heaters("paper-1000", n=1000, x0_mean=17.8, rest={"paper": (15.07, 1.31)}),
-            "riccati": _heaters("riccati", Pi=17.186),
-            "cold": _heaters("cold", x_out=-15.0),
-            "mixed-stock": _mixed_stock,
-            "load": _heaters("load", n=1000, x0_mean=17.8, change={"x_out": -15.0}),
-            "noise": _heaters("noise", n=1000, x0_mean=17.8, rest=noisy_heaters),
-        },
-    }.get(name, {})
+    own = {key: _declared(name, key, spec) for key, spec in tasks.of(name).scenarios.items()}
     families = {kind: _family(name, kind, family_seed) for kind in plant.families}
     return {f"{name}/{key}": build for key, build in (own | families).items()}
 
@@ -209,14 +152,16 @@ def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
         'outside' where any number is outside of what training drew, else 'edge' where one that is drawn has its least
         or greatest value, else 'inside'. How many houses there are and where they start counts for nothing.
     """
-    bounds = {name: (leaf.copy(), leaf.copy()) for name, leaf in _numbers(make(scenario.plant.name)[1]).items()}
+    start = tasks.of(scenario.plant.name).start
+    nominal = _numbers(make(scenario.plant.name)[1], start)
+    bounds = {name: (leaf.copy(), leaf.copy()) for name, leaf in nominal.items()}
     for name, *ends in ranges:
         field, _, element = name.partition("[")
         for bound, end in zip(bounds[field], ends, strict=True):
             bound[int(element[:-1]) if element else ...] = end
     bounds["noise"] = np.zeros(()), np.asarray(noise)
-    found = [("noise", np.asarray(scenario.sensor.noise)), *_numbers(scenario.params).items()]
-    found += [] if scenario.change is None else list(_numbers(scenario.change[1]).items())
+    found = [("noise", np.asarray(scenario.sensor.noise)), *_numbers(scenario.params, start).items()]
+    found += [] if scenario.change is None else list(_numbers(scenario.change[1], start).items())
     edge = False
     for name, leaf in found:
         low, high = bounds[name]
@@ -228,25 +173,17 @@ def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
     return "edge" if edge else "inside"
 
 
-def _numbers(params: Any) -> dict[str, np.ndarray]:
+def _numbers(params: Any, start: Sequence[str]) -> dict[str, np.ndarray]:
     """Leaves by their names, but for those of the start."""
     leaves = {path[-1].name: np.array(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
-    return {name: leaf for name, leaf in leaves.items() if name not in OF_THE_START}
+    return {name: leaf for name, leaf in leaves.items() if name not in start}
 
 
-def paper_scenarios(name: str) -> list[str]:
-    """Ids of the scenarios whose figure stands in the paper; where there are none, all of the plant's."""
-    if name == "pitch":
-        return ["pitch/paper", "pitch/delay-5.7", "pitch/delay-0.57", "pitch/delay-swapped"]
-    if name == "heaters":
-        return ["heaters/paper-4", "heaters/paper-1000"]
-    return list(catalogue(name))
+def reported(name: str) -> list[str]:
+    """Ids of the scenarios on which a training of the plant is evaluated: of the paper's plants those in the paper."""
+    return [f"{name}/{key}" for key in tasks.of(name).reported] or list(catalogue(name))
 
 
-def stability_scenarios(name: str) -> list[str]:
+def for_stability(name: str) -> list[str]:
     """Ids of the scenarios that stand for the plants whose local stability differs; of other plants the first."""
-    own = {
-        "pitch": ["paper", "delay-0.57", "delay-5.7", "delay-swapped", "uncertainty"],
-        "heaters": ["paper-4", "riccati", "mixed-stock"],
-    }.get(name)
-    return [f"{name}/{key}" for key in own] if own else list(catalogue(name))[:1]
+    return [f"{name}/{key}" for key in tasks.of(name).stability] or list(catalogue(name))[:1]

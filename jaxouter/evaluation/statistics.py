@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.stats
 
-KINDS = ("learned", "user", "rival", "limit", "preview")  # in the order in which they are shown
-RANKED = ("learned", "user", "rival")  # the others know what no outer loop can know
+KINDS = ("learned", "user", "baseline", "limit", "preview")  # in the order in which they are shown
+RANKED = ("learned", "user", "baseline")  # the others know what no outer loop can know
 RESAMPLES = 9999
 
 Rows = Sequence[Mapping[str, Any]]
@@ -152,7 +152,7 @@ def improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> dic
 def ranking(rows: Rows, policies: Policies) -> dict[str, dict[str, int]]:
     """Rank of each line, by scenario.
 
-    Learned, users' and rival policies that stay within the limits and do not diverge are ranked by their MAE, a line
+    Learned, users' and baseline policies that stay within the limits and do not diverge are ranked by their MAE, a line
     by its median over seeds; ties get the better rank. The other lines have none.
     """
     contestants = [line for line in lines(rows, policies) if line.kind in RANKED]
@@ -180,7 +180,7 @@ def summarise(rows: Rows, policies: Policies) -> dict[str, Any]:
         lines: by label: policy, run, kind, seeds, mean_rank (over all scenarios; without a rank it counts as the last),
         first (scenarios in which it has rank 1), unranked (scenarios in which it has none), and of the MAE's ratio to
         the limit `scenarios` (by id) and `mean`, each as `location` returns it (None where results are missing);
-        improvement: by label of a learned line and of each rival or user's line, as `improvement` returns it.
+        improvement: by label of a learned line and of each baseline or user's line, as `improvement` returns it.
     """
     every, table = lines(rows, policies), ranking(rows, policies).values()
     limited = scenarios([row for row in rows if row["ratio_to_limit"] is not None])
@@ -207,7 +207,7 @@ def _improvements(every: Sequence[Line]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for ours in (line for line in every if line.kind == "learned"):
         found[ours.label] = {}
-        for theirs in (line for line in every if line.kind in ("rival", "user")):
+        for theirs in (line for line in every if line.kind in ("baseline", "user")):
             common = [name for name in ours.rows if name in theirs.rows]
             if common:
                 samples = ([line.values(name, "mae") for name in common] for line in (ours, theirs))
@@ -257,30 +257,30 @@ def on_grid(swept: Mapping[str, Any], values: Sequence[Sequence[float]]) -> np.n
     return out
 
 
-def best_rival(sweep: Mapping[str, Any], policies: Policies) -> dict[str, Any] | None:
-    """The least MAE of all rivals at each point of the grid that they have in common.
+def best_baseline(sweep: Mapping[str, Any], policies: Policies) -> dict[str, Any] | None:
+    """The least MAE of all baselines at each point of the grid that they have in common.
 
     Returns:
-        values (a list an axis), mae and policy (nested lists, None where every rival diverged); None without a rival
-        or a common point.
+        values (a list an axis), mae and policy (nested lists, None where every baseline diverged); None without a
+        baseline or a common point.
     """
-    rivals = {
+    baselines = {
         name: swept
         for name, swept in sweep["policies"].items()
-        if name in policies and policies[name]["kind"] == "rival"
+        if name in policies and policies[name]["kind"] == "baseline"
     }
-    if not rivals:
+    if not baselines:
         return None
-    grids = [swept["values"] for swept in rivals.values()]
+    grids = [swept["values"] for swept in baselines.values()]
     values = [
         [v for v in grids[0][i] if all(np.isclose(grid[i], v, rtol=0, atol=1e-9).any() for grid in grids)]
         for i in range(len(sweep["axes"]))
     ]
     if not all(values):
         return None
-    maes = np.stack([on_grid(swept, values) for swept in rivals.values()])
+    maes = np.stack([on_grid(swept, values) for swept in baselines.values()])
     maes = np.where(np.isnan(maes), np.inf, maes)
     least = maes.min(0)
-    policy = np.where(np.isfinite(least), np.array([*rivals], object)[maes.argmin(0)], np.array(None))
+    policy = np.where(np.isfinite(least), np.array([*baselines], object)[maes.argmin(0)], np.array(None))
     mae = np.where(np.isfinite(least), least.astype(object), np.array(None))
     return {"values": values, "mae": mae.tolist(), "policy": policy.tolist()}

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxouter.evaluation.rivals.tuning import EPISODES, training_episodes
+from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
-from jaxouter.loop.identify import RUN_ONCE
+from jaxouter.identification.identify import RUN_ONCE
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
 from jaxouter.training.policy import LearnedParams, LearnedPolicy

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import chex
@@ -19,7 +20,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax.custom_batching import custom_vmap
 
-from jaxouter.loop import rewards, sensor
+from jaxouter.loop import closed_loop, rewards, sensor
+from jaxouter.loop.closed_loop import LoopState
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
 from jaxouter.loop.rewards import RewardParams
@@ -70,11 +72,17 @@ class Environment:
         drawn = None if self.plant.draw is None else self.plant.draw(key_draw, params.plant)
         plant_params = params.plant if drawn is None else drawn
         state = self.plant.training_start(key_start, plant_params)
-        y = self.plant.output(plant_params, state)
-        y_seen = sensor.measure(params.sensor, key_sensor, y, y)
-        goal, r = self.goal.init(key_goal, y_seen)
-        memory, obs = self.observer.observe(self.observer.init(r, y_seen), r, y_seen)
-        return obs, EnvState(state, drawn, goal, memory, r, y, y_seen, jnp.zeros((), jnp.int32))
+        loop = closed_loop.begin(self.plant, plant_params, state, partial(sensor.measure, params.sensor, key_sensor))
+        goal, r = self.goal.init(key_goal, loop.y_seen)
+        memory, obs = self.observer.observe(self.observer.init(r, loop.y_seen), r, loop.y_seen)
+        return obs, EnvState(state, drawn, goal, memory, r, loop.y, loop.y_seen, jnp.zeros((), jnp.int32))
+
+    def _bounded(self, r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """An output that has diverged, NaN included, is held at the bounds, and ends the episode."""
+        del r_tilde
+        low, high = self.plant.divergence_bounds
+        terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
+        return jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y), terminated
 
     def step_env(
         self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams
@@ -93,25 +101,22 @@ class Environment:
         """
         chex.assert_rank(action, 0)
         plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
-        r_tilde = jnp.clip(jnp.where(jnp.isnan(action), state.r, action), *plant.r_tilde_bounds)
-        plant_state = plant.step(p, state.plant, r_tilde, key)
-        y = plant.output(p, plant_state)
-
-        low, high = plant.divergence_bounds
-        terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
-        truncated = state.k + 1 >= plant.episode_steps
-        y = jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y)
+        action = jnp.where(jnp.isnan(action), state.r, action)
         # What the memory holds before the first step comes from the sensor; the reward is of the true y.
         before = jnp.where(state.k == 0, jnp.clip(state.y, *plant.r_tilde_bounds), state.memory.r_tilde_past[0])
-        reward = rewards.reward(params.reward, state.r, y, state.y, r_tilde, before)
+        loop = LoopState(state.plant, state.y, state.y_seen, before)
+        measure = partial(sensor.measure, params.sensor, key)
+        loop, reward, terminated = closed_loop.advance(
+            plant, p, params.reward, loop, state.r, action, key, measure, self._bounded
+        )
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
+        truncated = state.k + 1 >= plant.episode_steps
 
-        y_seen = sensor.measure(params.sensor, key, y, state.y_seen)
-        goal, r = self.goal.step(state.goal, y_seen)
-        memory = self.observer.record(state.memory, state.y_seen, r_tilde)
-        memory, obs = self.observer.observe(memory, r, y_seen)
-        state = EnvState(plant_state, state.plant_params, goal, memory, r, y, y_seen, state.k + 1)
-        return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": y_seen}
+        goal, r = self.goal.step(state.goal, loop.y_seen)
+        memory = self.observer.record(state.memory, state.y_seen, loop.r_tilde)
+        memory, obs = self.observer.observe(memory, r, loop.y_seen)
+        state = EnvState(loop.plant, state.plant_params, goal, memory, r, loop.y, loop.y_seen, state.k + 1)
+        return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": loop.y_seen}
 
     def step(
         self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams

@@ -1,4 +1,4 @@
-"""What the agent sees: present and past r, y, r~ and functions of them, nothing else (spec section 1).
+"""What the agent sees: present and past r, y, r~ and functions of them, nothing else (paper section II).
 
 The same functions serve the environment, the policy and the replay, which stores signals and builds observations from
 windows of them: what is not in `Signals` cannot reach the agent or the critic.

@@ -1,4 +1,4 @@
-"""The reward R = G(e) + H(r~) + B(y), from small functions of scalars (paper eq. 1; spec section 4)."""
+"""The reward R = G(e) + H(r~) + B(y), from small functions of scalars (paper eq. 1)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def reward(
         y, y_before: output at t_(k+1) and t_k.
         r_tilde, r_tilde_before: modified reference at t_k and t_(k-1).
 
-    Source: paper eq. 1 and 7, B of both sections; spec section 4.
+    Source: paper eq. 1 and 7, B of sections III and IV.
     """
     delta_y = jnp.abs(y - y_before)
     return (

@@ -12,7 +12,7 @@ import chex
 import jax
 
 from jaxouter.plants import heaters, pitch, versions
-from jaxouter.plants.base import Plant
+from jaxouter.plants.base import Plant, outputs
 
 __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate"]
 
@@ -109,11 +109,7 @@ def _drawing(plant: Plant, drawn: tuple[tuple[int, tuple[int, ...], float, float
 
 @partial(jax.jit, static_argnums=0)
 def _simulate(plant: Plant, params: Any, state: Any, r_tilde: jax.Array, key: chex.PRNGKey) -> jax.Array:
-    def step(state: Any, inputs: tuple[jax.Array, chex.PRNGKey]) -> tuple[Any, jax.Array]:
-        state = plant.step(params, state, *inputs)
-        return state, plant.output(params, state)
-
-    return jax.lax.scan(step, state, (r_tilde, jax.random.split(key, r_tilde.shape[0])))[1]
+    return outputs(plant, params, state, r_tilde, jax.random.split(key, r_tilde.shape[0]))
 
 
 def simulate(plant: Plant, params: Any, r_tilde: Any, key: chex.PRNGKey, state: Any = None) -> jax.Array:

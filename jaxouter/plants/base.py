@@ -57,9 +57,9 @@ class Plant:
     r_tilde_bounds: tuple[float, float]
     """Least and largest r~, in `y_unit`."""
     setpoint_range: tuple[float, float]
-    """Set-points of the training distribution (spec section 5)."""
+    """Set-points of the training distribution (paper section II)."""
     evaluation_range: tuple[float, float] = ()  # type: ignore[assignment]
-    """Set-points of the evaluation families (spec section 6); default: those of training."""
+    """Set-points of the evaluation families; default: those of training."""
     divergence_bounds: tuple[float, float] = ()  # type: ignore[assignment]
     """Training ends an episode when y leaves these; default: twice the range of r~ beyond each of its ends."""
     output_limit: float | None = None
@@ -80,7 +80,7 @@ class Plant:
     """Length of a family member in control steps (`steps`: one episode)."""
 
     differentiable: bool = True
-    """Whether its functions are; `oracle` and certificate need it."""
+    """Whether its functions are; `oracle` and the stability analysis need it."""
     affine: bool = False
     """Whether y is affine in r~ with additive noise along any episode; `clairvoyant` needs it."""
     start: Callable[[chex.PRNGKey, Any], Any] | None = None
@@ -136,6 +136,40 @@ class Plant:
     def training_start(self, key: chex.PRNGKey, params: Any) -> Any:
         """State at the start of a training episode."""
         return (self.start or self.init)(key, params)
+
+
+def parameters(params: Any, change: tuple[jax.Array, Any] | None, k: jax.Array) -> Any:
+    """The plant's parameters at step k, when from step `change[0]` on they are `change[1]`."""
+    if change is None:
+        return params
+    at, after = change
+    return jax.tree.map(lambda a, b: jnp.where(k >= at, a, b), after, params)
+
+
+def outputs(
+    plant: Plant,
+    params: Any,
+    state: Any,
+    r_tilde: jax.Array,
+    keys: chex.PRNGKey,
+    change: tuple[jax.Array, Any] | None = None,
+) -> jax.Array:
+    """Y (T,) after each control step of the plant alone.
+
+    Args:
+        plant, params, state: unbatched.
+        r_tilde: (T,), each held for one control step.
+        keys: (T,).
+        change: see `parameters`.
+    """
+
+    def step(state: Any, x: tuple[jax.Array, jax.Array, chex.PRNGKey]) -> tuple[Any, jax.Array]:
+        k, r_tilde_k, key = x
+        now = parameters(params, change, k)
+        state = plant.step(now, state, r_tilde_k, key)
+        return state, plant.output(now, state)
+
+    return jax.lax.scan(step, state, (jnp.arange(r_tilde.shape[0]), r_tilde, keys))[1]
 
 
 def array(name: str, value: Any, *shapes: tuple[int, ...]) -> jax.Array:

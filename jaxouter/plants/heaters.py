@@ -155,7 +155,7 @@ def init(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
 
 
 def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
-    """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it (spec section 5).
+    """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it.
 
     Lumped, the mean of the n houses' deviations is drawn as a normal number of the same variance, within 1 degC.
     """
@@ -188,7 +188,7 @@ def drift(
 ) -> jax.Array:
     """Deterministic part of dx/dt of the houses under their local law, degC/h; `decay` is exp(lambda1 t).
 
-    Source: paper section IV, x* = r~ in both terms; spec section 3.
+    Source: paper section IV, x* = r~ in both terms.
     """
     s_inf = r_tilde / (-p.Ua / p.Ca - p.Pi / (p.Ca**2 * p.r_u) - p.phi)
     s = s_inf + p.gamma / (p.beta2 - p.lambda1) * decay * (r_tilde - x0)

@@ -22,7 +22,7 @@ from jaxouter.plants import delay
 from jaxouter.plants.base import Plant, array
 
 CONTROL_STEP = 0.1  # s
-START_SPREAD = (1.0, 1.0, 0.5, 5.0)  # training starts are uniform in plus or minus this (spec section 5)
+START_SPREAD = (1.0, 1.0, 0.5, 5.0)  # training starts are uniform in plus or minus this
 
 A_747 = (
     (-0.003, 0.039, 0.0, -0.322),
@@ -79,7 +79,7 @@ def lqr(A: Any, B: Any, Q: Any, R: float) -> tuple[np.ndarray, float]:
     Returns:
         K1 (4,) and K2, of u = -K1 x - K2 xc.
 
-    Source: paper section III-A and its table; spec section 2.
+    Source: paper section III-A and its table.
     """
     A, B = np.asarray(A, float), np.asarray(B, float)
     augmented = np.zeros((5, 5))
@@ -246,7 +246,7 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
     NaN. Without vmap also for many plants that began together (see `PitchState`) with whole control steps: r~ and the
     delays may then have their trailing axes.
 
-    Source: paper section III; spec section 2.
+    Source: paper section III; what the paper leaves out is in docs/reproduction.md.
     """
     del key
     p, h = params, CONTROL_STEP / params.substeps

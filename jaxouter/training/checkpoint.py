@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-FORMAT = 2  # 1 had no checksum
+FORMAT = 2
 MARK = b"jaxouter sha256:"  # before the digest of all that precedes it, at the end of the file
 Tree = TypeVar("Tree")
 
@@ -111,17 +111,16 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         content = path.read_bytes()
         body, mark, digest = content[: -len(MARK) - 32], content[-len(MARK) - 32 : -32], content[-32:]
-        summed = mark == MARK
-        if summed and hashlib.sha256(body).digest() != digest:
+        if mark != MARK:
+            raise ValueError("it has no checksum: it is not whole, or not of this version")
+        if hashlib.sha256(body).digest() != digest:
             raise ValueError("its checksum differs: it is damaged")
-        with np.load(io.BytesIO(body if summed else content), allow_pickle=False) as file:
+        with np.load(io.BytesIO(body), allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             arrays = {name: file[name] for name in file.files if name != "header"}
-        if not isinstance(header, dict) or header.get("format") not in range(1, FORMAT + 1):
-            raise ValueError(f"it is not of format 1 to {FORMAT}, which this version reads")
-        if header["format"] > 1 and not summed:
-            raise ValueError("it has no checksum: it is not whole")
-    # Without a checksum to stop them, any bytes reach zipfile and NumPy, which answer with more than they document.
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ValueError(f"it is not of format {FORMAT}, the one that this version reads")
+    # A checksum can be right beside any bytes, and zipfile and NumPy answer them with more than they document.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
     except (

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxouter import plants
-from jaxouter.loop import identify
-from jaxouter.loop.identify import Dynamics
+from jaxouter import plants, tasks
+from jaxouter.identification import identify
+from jaxouter.identification.identify import Dynamics
 from jaxouter.loop.observation import HISTORY
 from jaxouter.plants import Plant
-from jaxouter.training.config import PRESETS, PretrainingConfig, TrainConfig
+from jaxouter.training.config import PretrainingConfig, TrainConfig
 
 EXPLORATION = 3  # folded into a key
 
@@ -29,12 +29,12 @@ class Choice(NamedTuple):
 def choose(config: TrainConfig) -> Choice:
     """The configuration with history, lags and length of the recorded episodes chosen by dead time and order.
 
-    They are identified from random r~. What is given stays; so does all of a plant that has presets of its own.
+    They are identified from random r~. What is given stays; so does all of the built-in plants.
 
     Raises:
         ValueError: no r~ moves the output.
     """
-    if config.plant in PRESETS:
+    if config.plant in tasks.TASKS:
         return Choice(config, None, ())
     plant, params = plants.make(config.plant)
     if plant.identified:

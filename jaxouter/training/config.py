@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
 import tyro
 
-from jaxouter import plants
-from jaxouter.agents.ddpg import DDPGConfig
-from jaxouter.loop.identify import LEVELS
+from jaxouter import agents, plants, tasks
+from jaxouter.agents import AgentConfig
+from jaxouter.identification.identify import LEVELS
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
@@ -62,25 +62,21 @@ class TrainConfig:
     plant: Annotated[str, tyro.conf.Positional]
     """Plant to learn on: pitch, heaters, FILE.py:NAME (your own), gym:ID, fmu:FILE or log:FILE."""
     preset: str
-    """The preset that gave the defaults."""
+    """Preset that supplies the defaults: default, paper; robust of pitch and heaters."""
+    agent: AgentConfig
+    """What learns; --agent NAME chooses another."""
     seed: int = 0
     """Seed of the first run."""
     seeds: int = 1
     """Runs with consecutive seeds, trained side by side."""
     devices: int = 1
     """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
-    spans several, which share its environments, replay and batch, and then draw otherwise than one. Those of a process
-    share the episodes of pretraining, seed after seed, with the draws of one."""
+    spans several, which share its environments, replay and batch; its random numbers then differ from those of one
+    device. Devices of one process share the episodes of pretraining, with the same random numbers as one device."""
     steps: int = 200_000
-    """Environment steps of the learner, over all environments, prefill included; 0: the pretrained actor stays."""
+    """Environment steps of the agent, over all environments, prefill included; 0: the pretrained actor stays."""
     environments: int = 1
     """Environments that roll out in parallel."""
-    updates: int = 1
-    """Gradient updates after each step of all environments; updates / environments is the update-to-data ratio."""
-    prefill: int = 1_000
-    """Environment steps with random actions, each held a while, before the first update."""
-    replay: int = 1_000_000
-    """Environment steps that the replay holds."""
     epoch: int = 2_000
     """Environment steps an epoch, the unit of progress, evaluation and checkpoints."""
     history: int | None = None
@@ -95,20 +91,12 @@ class TrainConfig:
     """Learn a correction of the static prefilter, identified first, instead of r~ itself."""
     reward_scale: float = 1.0
     """Multiplies the reward, in the plant's error scales, before it is learned from."""
-    noise_theta: float = 0.15
-    """Rate of return of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
-    noise_sigma: tuple[float, float] = (0.2, 0.2)
-    """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
-    noise_end: float = 1.0
-    """Factor on the volatility at the end of training, reached linearly."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
     """Control steps of the plant by which the dead time was identified before, to choose what is not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
     """The start."""
-    ddpg: DDPGConfig = field(default_factory=DDPGConfig)
-    """The learner."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -125,7 +113,7 @@ class TrainConfig:
             if not -HUGE < value < HUGE:  # NaN is refused too
                 raise ValueError(f"{name} is {value}; it must be a number between -{HUGE:,} and {HUGE:,}")
         self.pretraining.check()
-        self.ddpg.check()
+        self.agent.check()
         if (self.pretraining.plants > 1) and not self.randomise:
             raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
         if self.pretraining.episodes % self.pretraining.plants:
@@ -133,48 +121,27 @@ class TrainConfig:
                 f"pretraining.episodes is {self.pretraining.episodes}; it must be a multiple of the "
                 f"{self.pretraining.plants} plants"
             )
-        for name in ("seeds", "devices", "environments", "updates", "epoch", "reward_scale"):
+        for name in ("seeds", "devices", "environments", "epoch", "reward_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if self.steps < 0 or not (self.steps or self.pretraining.gradient_steps):
             raise ValueError(f"steps is {self.steps}; it must be positive, or 0 with pretraining")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; it must not be negative")
-        for name in ("steps", "epoch", "prefill"):
-            if getattr(self, name) % self.environments:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}; it must be a multiple of the {self.environments} environments"
-                )
+        if self.steps % self.environments:
+            raise ValueError(f"steps is {self.steps}; it must be a multiple of the {self.environments} environments")
         if max(self.seeds, self.devices) % min(self.seeds, self.devices):
             raise ValueError(
                 f"devices is {self.devices} and seeds is {self.seeds}; one must be a multiple of the other"
             )
-        for name, value in (("environments", self.environments), ("ddpg.batch_size", self.ddpg.batch_size)):
-            if value % self.shards:
-                raise ValueError(
-                    f"{name} is {value}; it must be a multiple of the {self.shards} devices that each of the "
-                    f"{self.seeds} seeds gets of {self.devices}"
-                )
-        if self.prefill < self.ddpg.batch_size or 0 < self.steps <= self.prefill:
-            most = f" and less than the {self.steps} steps" if self.steps else ""
+        if self.environments % self.shards:
             raise ValueError(
-                f"prefill is {self.prefill}; it must be at least the batch size, {self.ddpg.batch_size}{most}"
+                f"environments is {self.environments}; it must be a multiple of the {self.shards} devices that each of "
+                f"the {self.seeds} seeds gets of {self.devices}"
             )
-        if self.prefill <= self.ddpg.n_step * self.environments:
-            raise ValueError(
-                f"prefill is {self.prefill}; it must hold more than ddpg.n_step = {self.ddpg.n_step} steps of each"
-            )
-        if self.replay < self.ddpg.batch_size:
-            raise ValueError(f"replay is {self.replay}; it must hold at least a batch of {self.ddpg.batch_size}")
-        if not 0 <= self.redraw <= 1 or not 0 < self.noise_theta <= 1:
-            raise ValueError(
-                f"redraw is {self.redraw} and noise_theta is {self.noise_theta}; they must lie in [0, 1] and (0, 1]"
-            )
-        if min(self.noise_sigma) <= 0 or self.noise_end < 0:
-            raise ValueError(
-                f"noise_sigma is {self.noise_sigma} and noise_end is {self.noise_end}; "
-                "they must be positive and not negative"
-            )
+        self.agent.data.check(self.steps, self.epoch, self.environments, self.shards)
+        if not 0 <= self.redraw <= 1:
+            raise ValueError(f"redraw is {self.redraw}; it must lie in [0, 1]")
         return self
 
     @property
@@ -190,7 +157,7 @@ class TrainConfig:
     @property
     def epochs(self) -> int:
         """Epochs after the prefill; the last one may be shorter."""
-        return max(0, -(-(self.steps - self.prefill) // self.epoch))
+        return max(0, -(-(self.steps - self.agent.data.before) // self.epoch))
 
     @property
     def identification_steps(self) -> int:
@@ -209,98 +176,57 @@ class TrainConfig:
     @property
     def total_updates(self) -> int:
         """Gradient updates of one seed."""
-        return max(0, self.steps - self.prefill) // self.environments * self.updates
+        return self.agent.data.total_updates(self.steps, self.environments)
 
 
-PAPER = TrainConfig(plant="pitch", preset="paper", prefill=200)
-DEFAULT = TrainConfig(
-    plant="pitch",
-    preset="default",
-    steps=0,
-    environments=16,
-    updates=4,
-    prefill=8_000,
-    replay=200_000,
-    epoch=6_000,
-    residual=True,
-    reward_scale=0.1,
-    noise_theta=0.15,
-    noise_sigma=(0.0125, 0.1),
-    integral_steps=20.0,
-    pretraining=PretrainingConfig(gradient_steps=1_500, noise=0.015, load=0.1),
-    ddpg=DDPGConfig(
-        hidden=(128, 128),
-        layer_norm=True,
-        actor_rate=3e-4,
-        critic_rate=1e-3,
-        rate_decay="cosine",
-        critic_l2=0.0,
-        batch_size=256,
-        discount=0.99,
-        polyak=0.005,
-        saturation_penalty=1e-3,
-    ),
-)
-HEATERS = replace(
-    DEFAULT,
-    plant="heaters",
-    integral_steps=None,
-    reward_scale=1.0,
-    pretraining=replace(DEFAULT.pretraining, gradient_steps=2_000, noise=0.02, load=0.2),
-    ddpg=replace(DEFAULT.ddpg, discount=0.95),
-)
-ROBUST_PITCH = replace(
-    DEFAULT,
-    preset="robust",
-    history=80,  # longer than the longest delay
-    randomise=(
-        ("tau", 0.3, 0.7),
-        ("d1", 0.0, 0.8),
-        ("d2", 0.0, 6.0),
-        ("gain", 0.8, 1.2),
-        ("W[0]", 0.0, 0.2),
-        ("W[1]", -0.01, 0.01),
-        ("W[2]", -0.01, 0.01),
-    ),
-    pretraining=replace(
-        DEFAULT.pretraining, gradient_steps=12_000, episodes=512, plants=128, episode_steps=400, log_above=1.0
-    ),
-)
-ROBUST_HEATERS = replace(
-    HEATERS,
-    preset="robust",
-    history=20,
-    randomise=(
-        ("Pi", 0.3, 18.0),
-        ("x_out", -20.0, 5.0),
-        ("Ca", 7.0, 13.0),
-        ("Ua", 0.14, 0.26),
-        ("sigma", 0.0, 0.3),  # of four houses: the noise of their mean is that of any number of them
-    ),
-    pretraining=replace(HEATERS.pretraining, gradient_steps=5_000, episodes=1_024, plants=128),
-)
-OWN = {"default": DEFAULT, "paper": PAPER}
-PRESETS: dict[str, dict[str, TrainConfig]] = {
-    "pitch": {"default": DEFAULT, "robust": ROBUST_PITCH, "paper": PAPER},
-    "heaters": {
-        "default": HEATERS,
-        "robust": ROBUST_HEATERS,
-        "paper": replace(PAPER, plant="heaters", steps=400_000),
-    },
-}
+def preset(plant: str, name: str = "default", agent: str | None = None) -> TrainConfig:
+    """The preset called `name` of a plant.
 
-
-def preset(plant: str, name: str = "default") -> TrainConfig:
-    """The preset called `name` of a plant; a plant of one's own takes `OWN`.
+    Args:
+        plant, name: registered names.
+        agent: None: the preset's; another has its own defaults.
 
     Raises:
-        ValueError: unknown plant or preset; lists those that exist.
+        ValueError: unknown plant, preset or agent; lists those that exist.
     """
-    plants.resolve(plant)
-    presets = PRESETS.get(plant, OWN)
-    if name not in presets:
-        raise ValueError(f"there is no preset {name!r} for {plant}; the presets are: {', '.join(presets)}")
-    return replace(presets[name], plant=plant)
+    return configured(plant, name, tasks.options(plant, name), agent)
+
+
+def configured(plant: str, name: str, options: tasks.Options, agent: str | None = None) -> TrainConfig:
+    """The configuration of these options, among them the agent's name; of another agent its own defaults."""
+    options = dict(options)
+    own = options.pop("agent")
+    kind = agents.resolve(agent or own)
+    settings = {key: value for key, value in options.items() if key.startswith("agent.")}
+    rest = {key: value for key, value in options.items() if key not in settings}
+    base = TrainConfig(plant, name, _changed(kind(), settings if agent in (None, own) else {}, "agent."))
+    return _changed(base, rest, "")
+
+
+def with_options(config: TrainConfig, options: tasks.Options) -> TrainConfig:
+    """The configuration with these options changed, by their names, such as `agent.discount`.
+
+    Raises:
+        ValueError: there is no such option; lists those that exist.
+    """
+    return _changed(config, options, "")
+
+
+Config = TypeVar("Config")
+
+
+def _changed(config: Config, options: tasks.Options, prefix: str) -> Config:
+    """A dataclass with the options of its own, and of the dataclasses within it, whose names begin with a prefix."""
+    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(cast(Any, config))}
+    changes: dict[str, Any] = {}
+    for option, value in options.items():
+        name, _, inner = option.removeprefix(prefix).partition(".")
+        whole = not inner and (not dataclasses.is_dataclass(known.get(name)) or isinstance(value, type(known[name])))
+        if name not in known or not (whole or (inner and dataclasses.is_dataclass(known[name]))):
+            raise ValueError(f"there is no option {option!r}; there are: {', '.join(prefix + each for each in known)}")
+        within = changes.get(name, known[name])
+        changes[name] = _changed(within, {option: value}, f"{prefix}{name}.") if inner else value
+    return dataclasses.replace(cast(Any, config), **changes)
 
 
 def _numbers(values: Any, name: str = "") -> Iterator[tuple[str, float]]:
@@ -316,38 +242,29 @@ def _numbers(values: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Plain dict, for JSON."""
-    return dataclasses.asdict(config)
+    """Plain dict, for JSON; with the agent stands its name."""
+    values = dataclasses.asdict(config)
+    return values | {"agent": {"name": agents.name_of(config.agent), **values["agent"]}}
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
     """The configuration from what `to_dict` gave, also after a round trip through JSON.
 
     Raises:
-        ValueError: a field is missing, unknown or of another type.
+        ValueError: a field is missing, unknown or of another type, or the agent is not known.
     """
-    # Runs of versions that knew one device only, no pretraining, randomisation or options go on as they were.
-    whole = {
-        "devices": 1,
-        "randomise": (),
-        "explored_steps": 0,
-        "plant_options": {},
-        "pretraining": {},
-        "ddpg": {},
-        **values,
-    }
-    added_since = {
-        "plant_options": dataclasses.asdict(PlantOptions()),
-        "pretraining": dataclasses.asdict(PretrainingConfig()),
-        "ddpg": {"actor_from": 0},
-    }
-    for name, added in added_since.items():
-        if not isinstance(whole[name], dict):
-            raise ValueError(f"{name} is {whole[name]!r}; it must be an object with its fields")
-        whole[name] = added | whole[name]
-    kinds = (TrainConfig, whole), (PlantOptions, whole["plant_options"]), (PretrainingConfig, whole["pretraining"])
-    for cls, of_cls in (*kinds, (DDPGConfig, whole["ddpg"])):
-        names = {f.name for f in dataclasses.fields(cls)}
+    for name in ("agent", "plant_options", "pretraining"):
+        if not isinstance(values.get(name), dict):
+            raise ValueError(f"{name} is {values.get(name)!r}; it must be an object with its fields")
+    of_agent = dict(values["agent"])
+    name = of_agent.pop("name", None)
+    if not isinstance(name, str):
+        raise ValueError(f"agent.name is {name!r}; it must be the name of an agent")
+    kind = agents.resolve(name)
+    whole = {**values, "agent": of_agent}
+    parts = (TrainConfig, whole), (PlantOptions, whole["plant_options"]), (PretrainingConfig, whole["pretraining"])
+    for cls, of_cls in (*parts, (kind, of_agent)):
+        names = {f.name for f in dataclasses.fields(cast(Any, cls))}
         if set(of_cls) != names:
             raise ValueError(f"the configuration has fields {sorted(map(str, set(of_cls) ^ names))} missing or unknown")
-    return msgspec.convert(whole, TrainConfig)
+    return msgspec.convert(whole, TrainConfig, dec_hook=lambda _, found: msgspec.convert(found, kind))

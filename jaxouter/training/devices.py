@@ -20,11 +20,11 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxouter.agents.replay import ReplayState
+from jaxouter.identification.identify import RUN_ONCE
 from jaxouter.loop.environment import EnvParams
-from jaxouter.loop.identify import RUN_ONCE
 from jaxouter.training.config import TrainConfig
-from jaxouter.training.trainer import AXIS, Trainer, TrainState, build
+from jaxouter.training.environments import AXIS, TrainState
+from jaxouter.training.trainer import Trainer, build
 
 SEEDS = "seeds"
 HOUSES = "houses"
@@ -35,16 +35,6 @@ Tree = TypeVar("Tree")
 
 SEED: Any = P(SEEDS)
 ENVIRONMENT: Any = P(SEEDS, AXIS)
-LAYOUT = TrainState(
-    learner=SEED,
-    replay=ReplayState(rows=ENVIRONMENT, written=SEED),
-    env=ENVIRONMENT,
-    obs=ENVIRONMENT,
-    noise=ENVIRONMENT,
-    prior=SEED,
-    key=SEED,
-    steps=SEED,
-)
 
 
 @dataclass(frozen=True)
@@ -230,7 +220,21 @@ class Fleet:
         def place(spec: P, part: Any) -> Any:
             return jax.tree.map(lambda *leaves: self._place(spec, leaves), *part)
 
-        return jax.tree.map(lambda spec, *parts: place(spec, parts), LAYOUT, *states)
+        return jax.tree.map(lambda spec, *parts: place(spec, parts), self.layout, *states)
+
+    @property
+    def layout(self) -> Any:
+        """What of the states of all seeds lies on which axis of the mesh."""
+        return TrainState(
+            agent=SEED,
+            data=self.trainer.driver.layout(SEED, ENVIRONMENT),
+            env=ENVIRONMENT,
+            obs=ENVIRONMENT,
+            noise=ENVIRONMENT,
+            base=SEED,
+            key=SEED,
+            steps=SEED,
+        )
 
     def _place(self, spec: P, leaves: Sequence[Any]) -> jax.Array:
         stacked = jnp.stack(leaves) if _is_key(leaves[0]) else np.stack(leaves)
@@ -264,15 +268,17 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
             return jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), function(state, params))
 
         # Without the check of replication: what XLA is told by it is not used here, and scans would need casts.
-        return jax.shard_map(of_one, mesh=fleet.mesh, in_specs=(LAYOUT, P()), out_specs=out_specs, check_vma=False)
+        return jax.shard_map(
+            of_one, mesh=fleet.mesh, in_specs=(fleet.layout, P()), out_specs=out_specs, check_vma=False
+        )
 
     # Told where its results are, XLA does not choose another layout that would be compiled for once more.
-    layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), LAYOUT)
+    layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), fleet.layout)
     on_cpu = fleet.mesh.devices.flat[0].platform == "cpu"
 
     @partial(jax.jit, donate_argnums=0, out_shardings=layout, compiler_options=RUN_ONCE)
     def prefill(states: TrainState, params: EnvParams) -> TrainState:
-        return mapped(fleet.trainer.prefill, LAYOUT)(states, params)
+        return mapped(fleet.trainer.prefill, fleet.layout)(states, params)
 
     @partial(
         jax.jit,
@@ -282,7 +288,7 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
         compiler_options=EIGEN if on_cpu else None,
     )
     def epoch(states: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        return mapped(lambda *given: fleet.trainer.epoch(*given, steps), (LAYOUT, SEED))(states, params)
+        return mapped(lambda *given: fleet.trainer.epoch(*given, steps), (fleet.layout, SEED))(states, params)
 
     return prefill, epoch
 

@@ -9,7 +9,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxouter.agents.ddpg import DDPG
+from jaxouter.agents.networks import Actor, act
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.policy import AffineParams
 
@@ -18,21 +18,30 @@ class LearnedParams(NamedTuple):
     """What the learned policy needs to act."""
 
     actor: Any
-    prior: AffineParams  # r~ of a zero action; the middle of the range, or the static prefilter
+    base: AffineParams  # base law: r~ of a zero action; the middle of the range, or the static prefilter
 
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """r~ = clip(prior(r) + half the range of r~ times the actor's action)."""
+    """r~ = clip(base(r) + half the range of r~ times tanh(actor(observation))), whichever agent learned the actor."""
 
     observer: Observer
-    learner: DDPG
+    hidden: tuple[int, ...]
+    """Widths of the actor's hidden layers."""
     host: bool = False
 
-    def r_tilde(self, prior: AffineParams, r: jax.Array, action: jax.Array) -> jax.Array:
+    def init_actor(self, key: chex.PRNGKey) -> Any:
+        """Random parameters of the actor."""
+        return Actor(self.hidden, 1).init(key, jnp.zeros(self.observer.size))
+
+    def action(self, actor: Any, obs: jax.Array) -> jax.Array:
+        """Action in [-1, 1] (scalar) of an observation (n,)."""
+        return act(self.hidden, actor, obs)[0]
+
+    def r_tilde(self, base: AffineParams, r: jax.Array, action: jax.Array) -> jax.Array:
         """r~ (scalar, clipped to its bounds) of an action in [-1, 1] (scalar)."""
         low, high = self.observer.r_tilde_bounds
-        return jnp.clip(prior.offset + prior.slope * r + (high - low) / 2 * action, low, high)
+        return jnp.clip(base.offset + base.slope * r + (high - low) / 2 * action, low, high)
 
     def init(self, params: LearnedParams, r0: jax.Array, y0: jax.Array) -> Memory:
         """Memory before the first step."""
@@ -45,5 +54,5 @@ class LearnedPolicy:
         """Observe, act, remember; without exploration."""
         del key
         memory, obs = self.observer.observe(carry, r, y)
-        r_tilde = self.r_tilde(params.prior, r, self.learner.act(params.actor, obs)[0])
+        r_tilde = self.r_tilde(params.base, r, self.action(params.actor, obs))
         return self.observer.record(memory, y, r_tilde), r_tilde

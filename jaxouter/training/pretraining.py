@@ -1,7 +1,7 @@
-"""A start for the learner: its actor, trained by back-propagation through whole episodes (analytic policy gradient).
+"""Model-based pretraining: the actor, trained by back-propagation through whole episodes (analytic policy gradient).
 
-`Teacher` takes any differentiable plant. `pretrain` gives it one that was identified from a record of r~ and y alone;
-the oracle gives it the plant itself.
+`DifferentiableRollout` takes any differentiable plant. `pretrain` gives it one that was identified from a record of r~
+and y alone; `oracle` gives it the plant itself.
 
 The first layer is trained in whitened coordinates of the observation and folded back: consecutive samples of y differ
 little, and the small differences are what tells the state of the plant.
@@ -23,7 +23,8 @@ import optax
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from jaxouter.loop import counterfactual, identify, rewards
+from jaxouter.identification import counterfactual, identify
+from jaxouter.loop import closed_loop, rewards
 from jaxouter.loop.policy import AffineParams, Policy
 from jaxouter.loop.references import redrawn
 from jaxouter.plants import Plant
@@ -40,24 +41,24 @@ FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
 EPISODES = "episodes"  # the axis over which devices share them
 
 
-class Rehearsal(NamedTuple):
+class PretrainingState(NamedTuple):
     """The state of a rehearsal: all that its next gradient steps depend on."""
 
     before: Any  # whitened actors and optimiser state, each leaf (1, ...), of one report before
     now: Any  # the same, now
     best: Any  # mean reward
-    trust: Any  # share of the learning rate that the next steps take, at most 1
+    rate_scale: Any  # share of the learning rate that the next steps take, at most 1
     done: Any  # int32, gradient steps
 
     @classmethod
-    def begin(cls, actor: Any) -> Rehearsal:
+    def begin(cls, actor: Any) -> PretrainingState:
         """Before the first step, from an actor whose first layer takes the whitened observation."""
         actors = jax.tree.map(lambda leaf: leaf[None], actor)
         carry = actors, jax.vmap(ADAM.init)(actors)
         return cls(carry, carry, jnp.asarray(-np.inf, float), jnp.ones((), float), np.int32(0))
 
 
-Report = Callable[[Rehearsal, Callable[[], Any]], None]
+Report = Callable[[PretrainingState, Callable[[], Any]], None]
 """Told now and then how far a rehearsal is, and how to get the actor of that time."""
 Say = Callable[[str, int, int], None]
 """Told what is going on, recording or compiling, how much of it is done and of how much: 0 of 0 where nobody knows."""
@@ -71,7 +72,7 @@ class Whitening(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Teacher:
+class DifferentiableRollout:
     """Episodes of the training distribution, as a differentiable function. Static and hashable."""
 
     plant: Plant
@@ -90,34 +91,33 @@ class Teacher:
     @classmethod
     def of(
         cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int, devices: int = 1
-    ) -> Teacher:
-        """The teacher with the disturbances and the cost of a configuration, on as many devices as share a batch."""
+    ) -> DifferentiableRollout:
+        """The roll-out with the disturbances and the cost of a configuration, on as many devices as share a batch."""
         return cls(plant, policy, batch, config.noise, config.load, config.log_above, math.gcd(batch, devices))
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward a step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
         plant, steps = self.plant, self.plant.episode_steps
-        key_draw, key_start, key_r, key_run, key_quiet, key_noise, key_load = jax.random.split(key, 7)
+        key_draw, key_start, key_r, key_run, key_smooth, key_noise, key_load = jax.random.split(key, 7)
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
-        quiet = jax.random.bernoulli(key_quiet)
-        plant_params = jax.tree.map(partial(jnp.where, quiet), plant.noise_free(plant_params), plant_params)
+        smooth = jax.random.bernoulli(key_smooth)
+        plant_params = jax.tree.map(partial(jnp.where, smooth), plant.noise_free(plant_params), plant_params)
         price = rewards.params(plant)
         r = redrawn(key_r, steps, *plant.setpoint_range)
         load, noise = self._load(key_load, steps), self._noise(key_noise, steps)
         state = plant.training_start(key_start, plant_params)
-        y = plant.output(plant_params, state)
+        begun = closed_loop.begin(plant, plant_params, state)
 
-        def step(loop: Any, x: Any) -> Any:
-            state, carry, y, before = loop
+        def step(carry: Any, x: Any) -> Any:
+            loop, memory = carry
             r_k, noise_k, load_k, key = x
-            y_seen = y + noise_k
-            after, r_tilde = policy.act(policy_params, carry, r_k, y_seen)
-            state = plant.step(plant_params, state, r_tilde + load_k, key)
-            y_next = plant.output(plant_params, state)
-            reward = rewards.reward(price, r_k, y_next, y, r_tilde, before)
-            return (state, after, y_next, r_tilde), (reward / plant.error_scale, carry, r_k, y_seen)
+            loop = loop._replace(y_seen=loop.y + noise_k)
+            after, remembered, reward, _ = closed_loop.step(
+                plant, plant_params, price, policy, policy_params, loop, memory, r_k, key, load=load_k
+            )
+            return (after, remembered), (reward / plant.error_scale, memory, r_k, loop.y_seen)
 
-        begin = (state, policy.init(policy_params, r[0], y + noise[0]), y, jnp.clip(y, *plant.r_tilde_bounds))
+        begin = begun, policy.init(policy_params, r[0], begun.y + noise[0])
         _, (reward, *seen) = jax.lax.scan(step, begin, (r, noise, load, jax.random.split(key_run, steps)))
         return jnp.mean(reward), seen
 
@@ -135,12 +135,12 @@ class Teacher:
         return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
 
     @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
-    def whitening(self, prior: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
+    def whitening(self, base: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
         """From the observations under an actor whose action is zero."""
-        zero = jax.tree.map(jnp.zeros_like, self.policy.learner.init(key).actor)
+        zero = jax.tree.map(jnp.zeros_like, self.policy.init_actor(key))
 
         def observed(key: chex.PRNGKey) -> jax.Array:
-            _, seen = self.episode(self.policy, LearnedParams(zero, prior), plant_params, key)
+            _, seen = self.episode(self.policy, LearnedParams(zero, base), plant_params, key)
             return jax.vmap(lambda carry, r, y: self.policy.observer.observe(carry, r, y)[1])(*seen)
 
         obs = jax.vmap(observed)(jax.random.split(key, self.batch)).reshape(-1, self.policy.observer.size)
@@ -149,13 +149,13 @@ class Teacher:
 
     @partial(jax.jit, static_argnums=0)
     def train(
-        self, carry: Any, white: Whitening, prior: AffineParams, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
+        self, carry: Any, white: Whitening, base: AffineParams, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
     ) -> tuple[Any, jax.Array]:
         """Gradient steps with the given rates (n,), on fresh episodes each.
 
         Args:
             carry: whitened actors and optimiser state, each leaf (seeds, ...).
-            white, prior, plant_params: the same for all seeds.
+            white, base, plant_params: the same for all seeds.
             rates: learning rates.
             key: episodes, the same for all seeds.
 
@@ -164,7 +164,7 @@ class Teacher:
         """
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
-            params = LearnedParams(folded(actor, white), prior)
+            params = LearnedParams(folded(actor, white), base)
             cost = jax.vmap(lambda key: -self.episode(self.policy, params, plant_params, key)[0])(keys)
             return jnp.mean(self.log_above * jnp.log1p(cost / self.log_above) if self.log_above else cost)
 
@@ -221,7 +221,7 @@ def pretrain(
     learned: LearnedParams,
     key: chex.PRNGKey,
     report: Report = lambda at, actor: None,
-    begin: Rehearsal | None = None,
+    begin: PretrainingState | None = None,
     devices: int = 1,
     say: Say = lambda what, done, of: None,
 ) -> Any:
@@ -241,7 +241,7 @@ def pretrain(
     """
     key_record, *keys = jax.random.split(key, 3)
     if plant.identified:
-        return rehearse(config, plant, plant_params, policy, learned, keys, report, begin, devices, say)
+        return pretrain_on(config, plant, plant_params, policy, learned, keys, report, begin, devices, say)
     lags = config.lags or policy.observer.history
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
@@ -251,12 +251,12 @@ def pretrain(
         data = identify.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    return rehearse(
+    return pretrain_on(
         config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices, say
     )
 
 
-def rehearse(
+def pretrain_on(
     config: PretrainingConfig,
     plant: Plant,
     plant_params: Any,
@@ -264,7 +264,7 @@ def rehearse(
     learned: LearnedParams,
     keys: Sequence[chex.PRNGKey],
     report: Report = lambda at, actor: None,
-    begin: Rehearsal | None = None,
+    begin: PretrainingState | None = None,
     devices: int = 1,
     say: Say = lambda what, done, of: None,
 ) -> Any:
@@ -281,32 +281,32 @@ def rehearse(
         keys: two, of the whitening and of the episodes.
     """
     key_white, key_run = keys
-    prior, schools = learned.prior, [Teacher.of(config, plant, policy, config.batch_size, devices)]
+    base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices)]
     longer = config.gradient_steps  # from this step on
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
-        schools.append(replace(schools[0], plant=replace(plant, episode_steps=config.episode_steps)))
+        stages.append(replace(stages[0], plant=replace(plant, episode_steps=config.episode_steps)))
     say("compiling", 0, 0)
-    white = schools[0].whitening(prior, plant_params, key_white)
-    rates, at = cosine(config.gradient_steps), Rehearsal.begin(learned.actor) if begin is None else begin
+    white = stages[0].whitening(base, plant_params, key_white)
+    rates, at = cosine(config.gradient_steps), PretrainingState.begin(learned.actor) if begin is None else begin
 
     def actor() -> Any:
         return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)
 
     while (done := int(at.done)) < config.gradient_steps:
-        chunk, school = at.trust * rates[done : done + CHUNK], schools[done >= longer]
+        chunk, stage = at.rate_scale * rates[done : done + CHUNK], stages[done >= longer]
         if done == longer:  # for longer episodes, anew
             say("compiling", 0, 0)
-        found = school.train(at.now, white, prior, plant_params, chunk, jax.random.fold_in(key_run, done))
+        found = stage.train(at.now, white, base, plant_params, chunk, jax.random.fold_in(key_run, done))
         carry, reward = jax.device_get(found)  # not left on several devices: what comes in so is compiled for anew
         reward = reward[:, 0]
         first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
         best = first if done == longer else max(float(at.best), first)
         then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative
-            trust = jnp.minimum(1.0, GROWTH * at.trust)
-            at = Rehearsal(at.now, carry, jnp.asarray(max(best, reached), float), trust, then)
+            rate_scale = jnp.minimum(1.0, GROWTH * at.rate_scale)
+            at = PretrainingState(at.now, carry, jnp.asarray(max(best, reached), float), rate_scale, then)
         else:
-            at = Rehearsal(at.before, at.before, jnp.asarray(best, float), CUT * at.trust, then)
+            at = PretrainingState(at.before, at.before, jnp.asarray(best, float), CUT * at.rate_scale, then)
         report(at, actor)
     return actor()

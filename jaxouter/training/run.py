@@ -21,14 +21,18 @@ import jax
 from filelock import FileLock, Timeout
 
 import jaxouter
+from jaxouter import agents
+from jaxouter.agents import AGENTS, AgentConfig
 from jaxouter.loop.environment import EnvParams
 from jaxouter.plants import REGISTRY, Ranges
-from jaxouter.plants.sources import SOURCES, add
+from jaxouter.plants.registry import REGISTRATIONS, add, attribute
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
 from jaxouter.training.devices import Fleet
-from jaxouter.training.pretraining import Rehearsal
-from jaxouter.training.trainer import Trainer, TrainState, build
+from jaxouter.training.environments import TrainState
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+from jaxouter.training.pretraining import PretrainingState
+from jaxouter.training.trainer import Trainer, build
 
 FORMAT = 1
 RUNS = Path("runs")  # where a run goes that is told no other place
@@ -94,34 +98,10 @@ class Run:
                 f"{path} is a run on {name}, {was.get('reference', 'of another machine')!r} when it was made; code is "
                 "never imported because a run folder names it, so name this plant on the command line"
             )
-        if name in SOURCES and was.get("sha256") != SOURCES[name].sha256:
-            message = f"{path}: {SOURCES[name].reference} is not what it was when the run was made"
+        if name in REGISTRATIONS and was.get("sha256") != REGISTRATIONS[name].sha256:
+            message = f"{path}: {REGISTRATIONS[name].reference} is not what it was when the run was made"
             warnings.warn(message, RunWarning, stacklevel=2)
         return run
-
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """The folder for this process alone to write, until the block or the process ends.
-
-        Raises:
-            ValueError: another process has it.
-        """
-        holder, lock = self.path / "process", FileLock(self.path / "lock", timeout=0)
-        try:
-            lock.acquire()
-        except Timeout:
-            number = holder.read_text().strip() if holder.exists() else "?"
-            raise ValueError(
-                f"{self.path} is being trained by process {number}; wait for its end, or stop it"
-            ) from None
-        except OSError as error:
-            raise ValueError(f"{self.path} can't be locked: {error.strerror}") from None
-        with suppress(OSError):  # on a full disk the number of the process is not told
-            holder.write_text(str(os.getpid()))
-        try:
-            yield
-        finally:
-            lock.release()
 
     @contextmanager
     def gone_if_nothing_is_learned(self) -> Iterator[None]:
@@ -235,33 +215,42 @@ class Run:
         state, header = checkpoint.load(paths[epoch], like)
         return state, header["epoch"]
 
-    def save_rehearsal(self, seed: int, at: Rehearsal) -> None:
+    def policy(self, seed: int) -> tuple[LearnedPolicy, LearnedParams]:
+        """The policy of a seed, without exploration, from its newest whole checkpoint.
+
+        Raises:
+            ValueError: there is none, or it is not readable.
+        """
+        trainer, _ = self.trainer
+        return trainer.policy, trainer.policy_params(self.load(seed)[0])
+
+    def save_pretraining(self, seed: int, at: PretrainingState) -> None:
         """Keep how far the pretraining of a seed is, until there is a checkpoint.
 
         Raises:
             OSError: it can't be written; the one before is there.
         """
-        checkpoint.save(self._rehearsal(seed), at, seed=seed)
+        checkpoint.save(self._pretraining(seed), at, seed=seed)
 
-    def load_rehearsal(self, seed: int) -> Rehearsal | None:
+    def load_pretraining(self, seed: int) -> PretrainingState | None:
         """How far the pretraining of a seed is; None: at its beginning. Warns where what was kept is damaged."""
-        path = self._rehearsal(seed)
+        path = self._pretraining(seed)
         if not path.exists():
             return None
         trainer, _ = self.trainer
         try:
-            actor = jax.eval_shape(trainer.learner.init, jax.random.key(0)).actor
-            return checkpoint.load(path, jax.eval_shape(Rehearsal.begin, actor))[0]
+            actor = jax.eval_shape(trainer.policy.init_actor, jax.random.key(0))
+            return checkpoint.load(path, jax.eval_shape(PretrainingState.begin, actor))[0]
         except ValueError as error:
             warnings.warn(f"{error}; the pretraining begins anew", RunWarning, stacklevel=2)
             return None
 
-    def forget_rehearsals(self) -> None:
+    def forget_pretraining(self) -> None:
         """Drop what was kept of the pretraining."""
         for seed in self.seeds:
-            self._rehearsal(seed).unlink(missing_ok=True)
+            self._pretraining(seed).unlink(missing_ok=True)
 
-    def _rehearsal(self, seed: int) -> Path:
+    def _pretraining(self, seed: int) -> Path:
         return self.seed_folder(seed) / "pretraining.npz"
 
     def median_seed(self) -> int:
@@ -315,6 +304,29 @@ class Run:
         checkpoint.write(self.seed_folder(seed) / "metrics.jsonl", "".join(rows).encode())
 
 
+@contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """The folder for this process alone to write, until the block or the process ends.
+
+    Raises:
+        ValueError: another process has it.
+    """
+    holder, lock = path / "process", FileLock(path / "lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        number = holder.read_text().strip() if holder.exists() else "?"
+        raise ValueError(f"{path} is being trained by process {number}; wait for its end, or stop it") from None
+    except OSError as error:
+        raise ValueError(f"{path} can't be locked: {error.strerror}") from None
+    with suppress(OSError):  # on a full disk the number of the process is not told
+        holder.write_text(str(os.getpid()))
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
     """The configuration of a run, and where its plant was from.
 
@@ -347,6 +359,31 @@ def add_plant(reference: str, path: Path | None) -> str:
     return add(reference, _read(folder)[0].plant_options)
 
 
+def add_agent(reference: str | None) -> str | None:
+    """Make the agent that a command line names, if any, known, and give its name: a registered one, or FILE.py:CLASS.
+
+    The class is the agent's settings, see `jaxouter.agents.AgentConfig`.
+
+    Raises:
+        ValueError: there is no such agent.
+    """
+    if reference is None:
+        return None
+    file, colon, name = reference.rpartition(":")
+    if colon and file.endswith(".py") and reference not in AGENTS:
+        kind = attribute(Path(file), name, "an agent of your own")
+        if not (isinstance(kind, type) and issubclass(kind, AgentConfig)):
+            raise ValueError(f"{reference} is {kind!r}; it must be a subclass of jaxouter.agents.AgentConfig")
+        AGENTS[reference] = kind
+    agents.resolve(reference)
+    return reference
+
+
+def own_agents() -> tuple[str, ...]:
+    """References of the agents that were added."""
+    return tuple(name for name in AGENTS if ".py:" in name)
+
+
 def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
     """The run in a folder, its median seed and all its seeds; of the folder of one seed that one alone.
 
@@ -368,7 +405,7 @@ def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
     """What a result depends on beside the configuration; with one also where its plant is from, unless built in."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")
     device = jax.devices()[0]
-    source = None if config is None else SOURCES.get(config.plant)
+    source = None if config is None else REGISTRATIONS.get(config.plant)
     return {
         "versions": {"jaxouter": jaxouter.__version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},

@@ -21,7 +21,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
-import jaxouter.deploy.gymnasium  # noqa: F401 - registers the id
+import jaxouter.runtime.gymnasium  # noqa: F401 - registers the id
 from jaxouter import plants
 
 ID = "jaxouter/Pitch-v0"

@@ -1,6 +1,6 @@
 """Two cascaded tanks under a badly tuned PI level controller, whose valve has a dead band: a plant of your own.
 
-Check it, train on it, and compare what came out with its rivals, by this file and the name of the function at its end:
+Check it, train on it, and compare the result with baselines, by this file and the name of the function at its end:
 
     python -m jaxouter.check scripts/examples/tanks.py:Tanks
     python -m jaxouter.train scripts/examples/tanks.py:Tanks

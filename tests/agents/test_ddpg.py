@@ -6,14 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.agents.ddpg import DDPG, Batch, DDPGConfig, n_step_return, td_target
+from jaxouter.agents.agent import Transitions
+from jaxouter.agents.ddpg import DDPG, DDPGConfig, td_target
+from jaxouter.agents.returns import n_step_return
 
 SMALL = DDPGConfig(hidden=(16, 16), batch_size=8, actor_rate=1e-3, critic_l2=0.0)
 
 
-def random_batch(seed: int, size: int = 8, obs_size: int = 3) -> Batch:
+def random_batch(seed: int, size: int = 8, obs_size: int = 3) -> Transitions:
     keys = jax.random.split(jax.random.key(seed), 5)
-    return Batch(
+    return Transitions(
         obs=jax.random.normal(keys[0], (size, obs_size)),
         action=jax.random.uniform(keys[1], (size, 1), minval=-1.0),
         reward=jax.random.normal(keys[2], (size,)),
@@ -166,7 +168,7 @@ def test_update_is_the_same_with_and_without_jit():
 # Probe environments: one question each, with an answer known by hand.
 
 
-def learn(batch: Batch, updates: int):
+def learn(batch: Transitions, updates: int):
     cfg = DDPGConfig(
         hidden=(32, 32), actor_rate=3e-3, critic_rate=3e-3, rate_decay="cosine", critic_l2=0.0, polyak=0.05
     )
@@ -180,9 +182,9 @@ def learn(batch: Batch, updates: int):
     return learner, state
 
 
-def probe(obs, action, reward, discount, next_obs) -> Batch:
+def probe(obs, action, reward, discount, next_obs) -> Transitions:
     column = [jnp.asarray(x, float).reshape(-1, 1) for x in (obs, action, next_obs)]
-    return Batch(column[0], column[1], jnp.asarray(reward, float), jnp.asarray(discount, float), column[2])
+    return Transitions(column[0], column[1], jnp.asarray(reward, float), jnp.asarray(discount, float), column[2])
 
 
 def q_at(learner, state, obs, action):
@@ -226,9 +228,9 @@ def test_probe_best_action_depends_on_the_observation():
 @pytest.mark.parametrize(
     ("field", "value", "text"),
     [
-        ("discount", 1.0, r"ddpg.discount is 1.0; it must lie in \[0, 1\)"),
-        ("polyak", 0.0, "ddpg.polyak is 0.0"),
-        ("batch_size", 0, "ddpg.batch_size is 0"),
+        ("discount", 1.0, r"agent.discount is 1.0; it must lie in \[0, 1\)"),
+        ("polyak", 0.0, "agent.polyak is 0.0"),
+        ("batch_size", 0, "agent.batch_size is 0"),
         ("hidden", (5,), "at least two positive widths"),
         ("critics", 3, "1 or 2"),
         ("target_noise", -1.0, "must not be negative"),

@@ -178,13 +178,13 @@ def code() -> str:
         "loop/observation.py",
         "agents/networks.py",
         "training/config.py",
-        "evaluation/rivals/pi.py",
+        "evaluation/baselines/pi.py",
         "evaluation/metrics.py",
         "evaluation/rollout.py",
         "evaluation/scenarios.py",
         "evaluation/sweeps.py",
-        "evaluation/certificate.py",
-        "evaluation/board.py",
+        "evaluation/stability.py",
+        "evaluation/jobs.py",
         "evaluation/cache.py",
     ],
 )
@@ -202,7 +202,7 @@ def test_a_new_rival_changes_the_code_and_the_commands_do_not(package):
     for source in ("compare.py", "evaluation/report.py", "evaluation/figures.py"):
         (package / source).write_text("")
     assert code() == before
-    (package / "evaluation" / "rivals" / "new.py").write_text("")
+    (package / "evaluation" / "baselines" / "new.py").write_text("")
     assert code() != before
 
 

@@ -10,22 +10,22 @@ from jaxouter.evaluation.rollout import Traces
 @pytest.fixture(scope="module")
 def houses():
     """Scenarios of 4 and of 1000 houses, and traces of an episode of each."""
-    met = [scenarios.get(name, 1) for name in ("heaters/paper-4", "heaters/paper-1000")]
+    selected = [scenarios.get(name, 1) for name in ("heaters/paper-4", "heaters/paper-1000")]
     rng, traces = np.random.default_rng(0), {}
-    for scenario, n in zip(met, (4, 1000), strict=True):
+    for scenario, n in zip(selected, (4, 1000), strict=True):
         r = np.asarray(scenario.r, float)
         members = r[..., None] + rng.normal(0.0, 0.5, (*r.shape, n))
         y = members.mean(2)
         traces[scenario.id] = Traces(y[:, 0] - 1.0, r, y, r, -np.abs(r - y), None, None, members)
-    return met, traces
+    return selected, traces
 
 
 def test_the_houses_and_their_comfort_limit_are_drawn(houses, tmp_path):
-    met, traces = houses
-    sizes = [figures.paper(tmp_path / "paper.png", met, traces, traces).stat().st_size]
+    selected, traces = houses
+    sizes = [figures.paper(tmp_path / "paper.png", selected, traces, traces).stat().st_size]
     bare = {name: of._replace(members=None) for name, of in traces.items()}
     for each, name in ((traces, "houses.png"), (bare, "mean.png")):
-        path = figures.response(tmp_path / name, met[1], each[met[1].id], each[met[1].id])
+        path = figures.response(tmp_path / name, selected[1], each[selected[1].id], each[selected[1].id])
         assert path.read_bytes().startswith(b"\x89PNG")
         sizes.append(path.stat().st_size)
     assert sizes[1] > 1.02 * sizes[2]  # a picture of the houses holds more

@@ -10,10 +10,10 @@ import pytest
 
 from jaxouter import cli, compare, evaluate, plants, train
 from jaxouter.evaluation import pace, scenarios
-from jaxouter.evaluation.evaluate import evaluate as evaluated
-from jaxouter.evaluation.evaluate import rival
+from jaxouter.evaluation.policies import baseline
+from jaxouter.evaluation.policies import evaluate as evaluated
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.loop import identify
+from jaxouter.identification import identify
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
 from jaxouter.training.run import Run
@@ -88,11 +88,11 @@ def test_episodes_go_in_groups_of_as_many_as_may_be_side_by_side(mine):
 
 
 def test_what_is_known_of_the_inner_loop_is_not_run_again(mine):
-    alone = evaluated(rival("none", "mine"), [scenarios.get("mine/steps", 4)])
+    alone = evaluated(baseline("none", "mine"), [scenarios.get("mine/steps", 4)])
     before = Lag.steps
-    found = evaluated(rival("static", "mine"), [scenarios.get("mine/steps", 4)], alone=alone)
+    found = evaluated(baseline("static", "mine"), [scenarios.get("mine/steps", 4)], alone=alone)
     assert Lag.steps - before <= 4 * 20 + identify.LEVELS * 20
-    again = evaluated(rival("static", "mine"), [scenarios.get("mine/steps", 4)])
+    again = evaluated(baseline("static", "mine"), [scenarios.get("mine/steps", 4)])
     assert found["mine/steps"][1] == again["mine/steps"][1]
 
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import pytest
 from playwright.sync_api import Page, sync_playwright
 
-from jaxouter.evaluation import comparison, report, scenarios, statistics
-from jaxouter.evaluation.evaluate import Named, evaluate, rival
+from jaxouter.evaluation import comparison_figures, report, scenarios, statistics
 from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.policies import Named, baseline, evaluate
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.loop import identify
+from jaxouter.identification import identify
 from jaxouter.plants import make
 from jaxouter.training.run import surroundings
 from tests.precision import makes_nan
@@ -31,7 +31,7 @@ class Written(NamedTuple):
 
 def policies() -> dict[str, Named]:
     hostile = Named(HOSTILE, *identify.static(*make("pitch"), jax.random.key(1)))
-    return {"none": rival("none", "pitch"), "static": rival("static", "pitch"), HOSTILE: hostile}
+    return {"none": baseline("none", "pitch"), "static": baseline("static", "pitch"), HOSTILE: hostile}
 
 
 def row(name: str, identifier: str, figures: dict, limit: float) -> dict:
@@ -66,7 +66,7 @@ def sweep(named: dict[str, Named], kinds: dict, axes: dict[str, list[float]], no
         "axes": [{"name": name, "unit": "s", "values": values, "nominal": nominal} for name, values in axes.items()],
         "policies": {name: swept(each, axes) for name, each in named.items()},
     }
-    return content | {"best_rival": statistics.best_rival(content, kinds)}
+    return content | {"best_baseline": statistics.best_baseline(content, kinds)}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def written(tmp_path_factory) -> Written:
     """Two scenarios, two sweeps, three policies, of which `static` stands in for the limit."""
     folder, named = tmp_path_factory.mktemp("report"), policies()
     note = {"steps": 1600, "seconds": 0.1, "settings": {"name": HOSTILE, "gain": 3.0}, "note": f"{HOSTILE} & more."}
-    kinds = {"none": note | {"kind": "rival"}, "static": note | {"kind": "limit"}, HOSTILE: note | {"kind": "user"}}
+    kinds = {"none": note | {"kind": "baseline"}, "static": note | {"kind": "limit"}, HOSTILE: note | {"kind": "user"}}
     chosen = [scenarios.get(name, 2) for name in SCENARIOS]
     results = {name: evaluate(each, chosen) for name, each in named.items()}
     limits = {identifier: figures["mae"] for identifier, (_, figures) in results["static"].items()}
@@ -83,7 +83,7 @@ def written(tmp_path_factory) -> Written:
         for name, found in results.items()
         for identifier, (_, figures) in found.items()
     ]
-    certificate = [
+    stability = [
         {"policy": name, "scenario": "pitch/paper", "set_point": point, "spectral_radius": radius, "note": remark}
         for name, radius, remark in (("none", 0.99, ""), (HOSTILE, 1.01, HOSTILE))
         for point in (-5.0, 5.0)
@@ -104,15 +104,15 @@ def written(tmp_path_factory) -> Written:
             "pitch/pilot-delay": sweep(named, kinds, {"tau": [0.0, 0.5, 1.0]}, 0.5),
             "pitch/controller-delays": sweep(named, kinds, {"d1": [0.0, 0.5], "d2": [0.0, 0.3, 0.6]}, 0.0),
         },
-        "certificate": certificate,
+        "stability": stability,
     }
     responses = {
-        scenario.id: comparison.responses(
+        scenario.id: comparison_figures.responses(
             folder / f"{i}.png", scenario, {name: results[name][scenario.id][0] for name in named}, list(named)
         )
         for i, scenario in enumerate(chosen)
     }
-    figures = comparison.draw(folder, content)
+    figures = comparison_figures.draw(folder, content)
     return Written(report.write(folder / "report.html", content, figures, responses), content)
 
 
@@ -152,7 +152,7 @@ def overflow(page: Page) -> int:
 
 def test_every_picture_is_seen(page, written):
     images = page.locator("img").all()
-    assert len(images) == 2 + len(written.comparison["sweeps"]) + 1 + 1  # errors, effort, sweeps, certificate, response
+    assert len(images) == 2 + len(written.comparison["sweeps"]) + 1 + 1  # errors, effort, sweeps, stability, response
     for image in images:
         assert image.is_visible()
         assert image.evaluate("image => image.complete && image.naturalWidth") > 100
@@ -191,7 +191,7 @@ def test_hostile_names_stay_text(page):
     assert page.evaluate("document.scripts.length") == 1
     assert page.locator("section#errors th", has_text=HOSTILE).count() == 1
     assert page.locator("section#policies td", has_text=f"{HOSTILE} & more.").count() == 3
-    assert page.locator("section#certificate li", has_text=HOSTILE).count() == 1
+    assert page.locator("section#stability li", has_text=HOSTILE).count() == 1
 
 
 def test_errors_show_mae_or_ratio(page, written):
@@ -238,7 +238,7 @@ def line(kind, mean_rank, first, unranked=0, ratios=()):
     ("lines", "said"),
     [
         (
-            {"pi": line("rival", 1.2, 3), "learned": line("learned", 1.8, 1, 2, (1.5, None, 1.1, 1.2))},
+            {"pi": line("baseline", 1.2, 3), "learned": line("learned", 1.8, 1, 2, (1.5, None, 1.1, 1.2))},
             "learned is not the best: the lowest MAE within the limits in 1 of 4 scenarios, mean rank 1.80 (pi, the "
             "best: 3, mean rank 1.20); it leaves the limits or diverges in 2. Its MAE is 1.20× the limit's in the "
             "median scenario, from 1.10× (2) to 1.50× (0); it diverged in 1.",
@@ -249,7 +249,7 @@ def line(kind, mean_rank, first, unranked=0, ratios=()):
             "ranked. How far it is from the limit is not known: the limit was not computed.",
         ),
         (
-            {"learned": line("learned", 1.5, 2, ratios=(1.25,)), "pi": line("rival", 1.5, 2)},
+            {"learned": line("learned", 1.5, 2, ratios=(1.25,)), "pi": line("baseline", 1.5, 2)},
             "learned shares the first place: the lowest MAE within the limits in 2 of 4 scenarios, mean rank 1.50 "
             "(pi, its equal: 2, mean rank 1.50). Its MAE is 1.25× the limit's (0).",
         ),
@@ -278,7 +278,7 @@ def test_figures_have_three_digits(value, text):
 
 def test_styles_hold_when_a_policy_is_added():
     names = ["learned a", "learned b", "pi", "x.py", "y.py", "oracle"]
-    look = comparison.styles(names)
+    look = comparison_figures.styles(names)
     assert len({(style.color, str(style.ls)) for style in look.values()}) == len(names)
-    assert comparison.styles([*names, "z.py"]).items() >= look.items()
-    assert comparison.styles(["pi"])["pi"] == look["pi"]
+    assert comparison_figures.styles([*names, "z.py"]).items() >= look.items()
+    assert comparison_figures.styles(["pi"])["pi"] == look["pi"]

@@ -6,8 +6,8 @@ import pytest
 from jaxouter.evaluation import statistics
 
 POLICIES = {
-    "none": {"kind": "rival"},
-    "pi": {"kind": "rival"},
+    "none": {"kind": "baseline"},
+    "pi": {"kind": "baseline"},
     "learned": {"kind": "learned"},
     "mine.py": {"kind": "user"},
     "oracle": {"kind": "limit"},
@@ -134,7 +134,7 @@ def test_without_a_limit_there_is_no_ratio():
     assert set(found["lines"]["pi"]["mean"].values()) == {None}
 
 
-def test_best_rival_is_of_the_points_that_all_rivals_have():
+def test_best_baseline_is_of_the_points_that_all_baselines_have():
     sweep = {
         "axes": [{"name": "x"}, {"name": "z"}],
         "policies": {
@@ -143,13 +143,13 @@ def test_best_rival_is_of_the_points_that_all_rivals_have():
             "learned": {"values": [[0.0], [1.0]], "mae": [[0.1]]},
         },
     }
-    assert statistics.best_rival(sweep, POLICIES) == {
+    assert statistics.best_baseline(sweep, POLICIES) == {
         "values": [[0.0, 0.2], [1.0, 2.0]],
         "mae": [[5.0, None], [2.0, 3.0]],
         "policy": [["none", None], ["pi", "none"]],
     }
     alone = sweep | {"policies": {"learned": sweep["policies"]["learned"]}}
-    assert statistics.best_rival(alone, POLICIES) is None
+    assert statistics.best_baseline(alone, POLICIES) is None
 
 
 def test_values_on_another_grid_are_missing_where_the_policy_did_not_run():

@@ -37,7 +37,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 def judged(**slopes: float) -> dict[str, Any]:
     """The verdict on policies by seed whose network does nothing; with a DC gain of 0.5 a slope of 2 is right."""
     policy = build(small("kind"))[0].policy
-    idle = jax.tree.map(jnp.zeros_like, jax.eval_shape(policy.learner.init, jax.random.key(0)).actor)
+    idle = jax.tree.map(jnp.zeros_like, jax.eval_shape(policy.init_actor, jax.random.key(0)))
     learned = {int(seed[1:]): LearnedParams(idle, affine(slope)) for seed, slope in slopes.items()}
     return judge(PLANT, PARAMS, jax.random.key(5), policy, learned, SIMPLE)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
-from jaxouter.evaluation.certificate import certify
+from jaxouter.evaluation.stability import analyse
 from jaxouter.loop.policy import none
 from jaxouter.plants import arx
 from jaxouter.plants.arx import Model
@@ -89,7 +89,7 @@ def test_variables_and_settled_are_inverse() -> None:
 
 def test_a_loop_around_it_is_certified() -> None:
     """r~ = r leaves the poles of the model: 0.5 and 0.2 of z^2 - 0.5 z - 0.2."""
-    (found,) = certify(*none(PLANT), PLANT, PARAMS, [1.0])
+    (found,) = analyse(*none(PLANT), PLANT, PARAMS, [1.0])
     assert found.spectral_radius == pytest.approx((0.5 + np.sqrt(0.25 + 0.8)) / 2, abs=1e-6)
     assert found.y == pytest.approx(1.0 + 1 / 3, abs=1e-6)
 

@@ -10,7 +10,7 @@ import pytest
 
 from jaxouter import check, evaluate, train
 from jaxouter.loop.references import FAMILIES
-from jaxouter.plants import Plant, contract, declaration
+from jaxouter.plants import Plant, declaration, interface
 from jaxouter.plants.simulators import PlantOptions
 from tests.lag import LAG, make
 from tests.load import ROOT
@@ -130,4 +130,4 @@ def test_every_command_refuses_a_declaration_alike(command, tmp_path, monkeypatc
 )
 def test_what_a_function_returns_is_refused_by_its_name(field, function, text):
     with pytest.raises(ValueError, match=re.escape(text)):
-        contract.shapes(changed(**{field: function}), make()[1])
+        interface.shapes(changed(**{field: function}), make()[1])

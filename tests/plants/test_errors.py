@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from jaxouter import check, cli, compare, evaluate, export, live, plants, train
-from jaxouter.evaluation import board
-from jaxouter.evaluation.board import Contender, Job
-from jaxouter.plants import host, simulate, sources
+from jaxouter.evaluation import jobs
+from jaxouter.evaluation.jobs import Entrant, Job
+from jaxouter.plants import host, registry, simulate
 from jaxouter.plants.errors import PlantError, said
 from tests.precision import makes_nan
 
@@ -25,7 +25,7 @@ DECLARED |= dict(r_tilde_bounds=(-2.0, 2.0), setpoint_range=(-0.5, 0.5))
 @pytest.fixture(autouse=True)
 def forgotten():
     """No plant that a test adds stays."""
-    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         yield
 
 
@@ -117,9 +117,9 @@ def test_an_error_goes_from_a_process_to_another():
 
 def test_a_plant_that_fails_in_a_comparison_is_named(capsys):
     plants.REGISTRY["mine"] = lambda: MINE
-    job = Job("meet", Contender("none", "rival"), "mine", "mine/steps")
+    job = Job("evaluate", Entrant("none", "baseline"), "mine", "mine/steps")
     with pytest.raises(PlantError, match="plant mine, control step 4 of the episode with seed"):
-        board.run(job)
+        jobs.run(job)
     assert capsys.readouterr().err == ""
 
 
@@ -175,7 +175,7 @@ def Own():
 )
 def test_a_plant_in_jax_that_fails_is_one_message(tmp_path, limit, text, capsys):
     (tmp_path / "own.py").write_text(OWN.replace("LIMIT", str(limit)))
-    plant, params = plants.make(sources.add(f"{tmp_path}/own.py:Own"))
+    plant, params = plants.make(registry.add(f"{tmp_path}/own.py:Own"))
     failed(lambda: simulate(plant, params, jnp.ones(8), jax.random.key(0)))
     assert capsys.readouterr().err.strip() == text
 
@@ -207,7 +207,7 @@ def short(monkeypatch):
 def test_an_environment_that_ends_is_named_with_the_step(capsys, tmp_path, monkeypatch):
     """Its `dt` is that of the plant, and its bounds have the digits that they show."""
     monkeypatch.chdir(tmp_path)
-    plant, _ = plants.make(sources.add("gym:Short-v0"))
+    plant, _ = plants.make(registry.add("gym:Short-v0"))
     assert (plant.control_step, plant.time_unit, plant.r_tilde_bounds) == (0.02, "s", (-0.1, 0.1))
     with pytest.raises(SystemExit) as end:
         check.main(["gym:Short-v0"])
@@ -223,7 +223,7 @@ def test_an_environment_that_ends_is_named_with_the_step(capsys, tmp_path, monke
 def test_a_control_step_that_is_none_is_refused(dt, monkeypatch):
     monkeypatch.setattr(Short, "dt", dt)
     with pytest.raises(ValueError, match=r"gym:Short-v0 has no --control-step, and its dt is .* it must be a positive"):
-        sources.add("gym:Short-v0")
+        registry.add("gym:Short-v0")
 
 
 @pytest.mark.parametrize("broken", ["raise OSError('no licence')", "import sys; sys.exit(3)", "def ("])
@@ -233,7 +233,7 @@ def test_a_module_that_can_not_be_imported_is_one_message(tmp_path, monkeypatch,
     monkeypatch.delitem(sys.modules, "broken", raising=False)
     for reference in (f"{tmp_path}/broken.py:Own", "gym:broken:Own-v0"):
         with pytest.raises(ValueError, match=r"(OSError: no licence|SystemExit: 3|SyntaxError)"):
-            sources.add(reference)
+            registry.add(reference)
 
 
 @pytest.mark.parametrize(

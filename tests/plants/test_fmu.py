@@ -15,8 +15,8 @@ from fmpy import platform, platform_tuple, sharedLibraryExtension
 from fmpy.validation import validate_fmu
 
 from jaxouter import check, export, plants, train
-from jaxouter.deploy import c
-from jaxouter.plants import contract, simulate, sources
+from jaxouter.exports import c
+from jaxouter.plants import interface, registry, simulate
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.run import Run
 from tests.training.small import TINY, small
@@ -27,7 +27,7 @@ K, T, D = 0.5, 0.3, 0.25  # of lag_fmi3.c
 
 @pytest.fixture(autouse=True)
 def forgotten():
-    with patch.dict(plants.REGISTRY), patch.dict(sources.SOURCES):
+    with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         yield
 
 
@@ -95,16 +95,16 @@ def test_an_exported_controller_is_a_plant(controller, tmp_path, monkeypatch, ca
 
 def test_what_an_fmu_leaves_open_must_be_said(controller):
     with pytest.raises(ValueError, match=r"--input is None; .*outer.fmu has: r, y"):
-        sources.add(f"fmu:{controller}")
+        registry.add(f"fmu:{controller}")
     with pytest.raises(ValueError, match=r"r~ lies between nan and nan: give it finite bounds"):
-        sources.add(f"fmu:{controller}", PlantOptions(input="r"))
+        registry.add(f"fmu:{controller}", PlantOptions(input="r"))
 
 
 def test_an_fmu_for_another_system_is_refused(lag, tmp_path):
     with zipfile.ZipFile(lag) as whole, zipfile.ZipFile(tmp_path / "lag.fmu", "w") as file:
         file.writestr("modelDescription.xml", whole.read("modelDescription.xml"))
     with pytest.raises(ValueError, match=r"lag.fmu can't be started here: Cannot find shared library"):
-        sources.add(f"fmu:{tmp_path}/lag.fmu")
+        registry.add(f"fmu:{tmp_path}/lag.fmu")
 
 
 def response(r_tilde, times):
@@ -114,9 +114,9 @@ def response(r_tilde, times):
 
 
 def test_an_fmu_of_fmi_3_says_what_it_is_and_answers_as_its_equation_does(lag):
-    plant, params = plants.make(sources.add(f"fmu:{lag}"))
+    plant, params = plants.make(registry.add(f"fmu:{lag}"))
     assert (plant.r_tilde_bounds, plant.control_step, plant.y_unit) == ((-4.0, 4.0), 0.1, "cm")
-    assert [what for what, wrong in contract.behaviour(plant, params) if wrong] == []
+    assert [what for what, wrong in interface.behaviour(plant, params) if wrong] == []
     rng = np.random.default_rng(0)
     for r_tilde in (np.ones(50), rng.uniform(-4.0, 4.0, 50), rng.uniform(-4.0, 4.0, 50)):
         y = simulate(plant, params, r_tilde.astype(np.float32), jax.random.key(0))
@@ -155,7 +155,7 @@ def test_what_can_be_made_once_or_not_be_reset_answers_all_the_same(tmp_path, de
     """From its start again, from an older moment, and side by side."""
     path = faulty(tmp_path, *defined.split(), changes=changes)
     with pytest.warns(UserWarning, match=warning):
-        plant, params = plants.make(sources.add(f"fmu:{path}"))
+        plant, params = plants.make(registry.add(f"fmu:{path}"))
     begun = plant.init(jax.random.key(0), params)
     after = [plant.step(params, begun, jnp.asarray(r_tilde), None) for r_tilde in (1.0, -2.0, 1.0)]
     after = [plant.step(params, state, jnp.asarray(1.0), None).y for state in after]
@@ -184,16 +184,16 @@ def test_what_can_be_made_once_or_not_be_reset_answers_all_the_same(tmp_path, de
 )
 def test_what_an_fmu_refuses_is_said_before_anything_is_learned(tmp_path, defined, changes, options, text):
     with pytest.raises(ValueError, match=re.escape(text)):
-        sources.add(f"fmu:{faulty(tmp_path, *defined.split(), changes=changes)}", PlantOptions(**options))
+        registry.add(f"fmu:{faulty(tmp_path, *defined.split(), changes=changes)}", PlantOptions(**options))
 
 
 def test_a_description_that_breaks_the_standard_is_told_whole_or_taken_as_it_is(tmp_path):
     path = faulty(tmp_path, changes=[('<Real start="0" min', "<Real min"), ('causality="output"', 'causality="input"')])
     with pytest.raises(ValueError, match="--no-validate") as error:
-        sources.add(f"fmu:{path}")
+        registry.add(f"fmu:{path}")
     assert str(error.value).count("\n- ") == 2
     with pytest.raises(ValueError, match="--output is None"):
-        sources.add(f"fmu:{path}", PlantOptions(input="r_tilde", validate=False))
+        registry.add(f"fmu:{path}", PlantOptions(input="r_tilde", validate=False))
 
 
 def test_a_control_step_is_a_multiple_of_a_fixed_step_size(tmp_path):
@@ -203,10 +203,10 @@ def test_a_control_step_is_a_multiple_of_a_fixed_step_size(tmp_path):
     ]
     path = compiled(tmp_path, "lag_fmi3", platform_tuple, changes=fixed)
     with pytest.raises(ValueError, match=r"--control-step is 0.12; .* multiple of the FMU's fixed .* 0.05 s"):
-        sources.add(f"fmu:{path}", PlantOptions(control_step=0.12))
-    assert plants.make(sources.add(f"fmu:{path}", PlantOptions(control_step=0.15)))[0].control_step == 0.15
+        registry.add(f"fmu:{path}", PlantOptions(control_step=0.12))
+    assert plants.make(registry.add(f"fmu:{path}", PlantOptions(control_step=0.15)))[0].control_step == 0.15
 
 
 def test_an_episode_is_over_by_the_stop_time(tmp_path):
-    plant, _ = plants.make(sources.add(f"fmu:{faulty(tmp_path, 'STOP=10')}"))
+    plant, _ = plants.make(registry.add(f"fmu:{faulty(tmp_path, 'STOP=10')}"))
     assert (plant.episode_steps, plant.family_steps) == (100, 100)

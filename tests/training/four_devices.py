@@ -10,10 +10,10 @@ import pytest
 from jaxouter import plants
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.devices import Fleet, spread
-from jaxouter.training.pretraining import Teacher
+from jaxouter.training.epochs import train
+from jaxouter.training.off_policy import FIELDS
+from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.run import Run
-from jaxouter.training.train import train
-from jaxouter.training.trainer import FIELDS
 from tests import lag
 from tests.training.small import small
 
@@ -34,8 +34,8 @@ def test_seeds_on_devices_of_their_own_equal_single_runs(tmp_path):
     for seed in (1, 2):  # one on each device, of different rounds
         alone = train(Run.create(small(seed=seed, **SHORT), tmp_path / f"alone-{seed}"))
         assert alone is not None
-        chex.assert_trees_all_close(together[seed].learner, alone[seed].learner, rtol=1e-5, atol=1e-6)
-        chex.assert_trees_all_close(together[seed].replay, alone[seed].replay, rtol=1e-5, atol=1e-5)
+        chex.assert_trees_all_close(together[seed].agent, alone[seed].agent, rtol=1e-5, atol=1e-6)
+        chex.assert_trees_all_close(together[seed].data, alone[seed].data, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(("seeds", "shards"), [(1, 4), (2, 2)])
@@ -48,16 +48,16 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
     before = fleet.take(state)
     state, metrics = fleet.epoch(state, params, 320)
     after = fleet.take(state)
-    for leaf in jax.tree.leaves((state.learner, metrics)):
+    for leaf in jax.tree.leaves((state.agent, metrics)):
         by_seed = {}
         for shard in leaf.addressable_shards:
             np.testing.assert_array_equal(shard.data, by_seed.setdefault(shard.index[0].start, shard.data))
         assert len(by_seed) == seeds
     for i in range(seeds):
         assert int(after[i].steps) == 960
-        assert int(after[i].learner.updates) == 40
-        assert not np.array_equal(*(jax.tree.leaves(states[i].learner.actor)[0] for states in (before, after)))
-        written = after[i].replay.rows[:, trainer.replay.mirror :][:, :120]
+        assert int(after[i].agent.updates) == 40
+        assert not np.array_equal(*(jax.tree.leaves(states[i].agent.actor)[0] for states in (before, after)))
+        written = after[i].data.rows[:, trainer.driver.replay.mirror :][:, :120]
         action = written[..., FIELDS.index("action")]
         assert len(np.unique(action[:, 0])) == 8  # no two environments draw alike
         assert np.all(np.diff(np.std(np.diff(action[:, 80:]), 1)[::2]) > 0)  # the ladder goes on from shard to shard
@@ -65,7 +65,7 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
 
 def test_checkpoint_of_four_devices_goes_on_with_one(spanning):
     written, done = spanning.load(0)
-    assert (done, written.replay.rows.shape[0], len(written.noise)) == (1, 8, 8)
+    assert (done, written.data.rows.shape[0], len(written.noise.x)) == (1, 8, 8)
     on_one = replace(spanning, config=replace(spanning.config, devices=1))
     chex.assert_trees_all_equal(on_one.fleet.take(on_one.fleet.put([written]))[0], jax.device_get(written))
     finals = train(on_one)
@@ -78,24 +78,25 @@ def test_compiled_loop_copies_no_part_of_the_replay(spanning):
     fleet, (trainer, params) = spanning.fleet, spanning.trainer
     state = fleet.put([trainer.start(0, params)])
     text = fleet.epoch.lower(state, params, 320).compile().as_text()
-    part = ",".join(map(str, (2, *state.replay.rows.shape[2:])))
+    part = ",".join(map(str, (2, *state.data.rows.shape[2:])))
     lines = [line for line in text.splitlines() if f"f32[{part}]" in line or f"f32[1,{part}]" in line]
     assert lines
     assert sum(" copy(" in line for line in lines) <= 1  # before the loop
 
 
-def test_an_actor_rehearsed_on_four_devices_is_that_of_one(tmp_path, monkeypatch):
+def test_an_actor_pretrained_on_four_devices_is_that_of_one(tmp_path, monkeypatch):
     monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
-    taught = []
-    monkeypatch.setattr(Teacher, "of", lambda *given, of=Teacher.of: taught.append(of(*given)) or taught[-1])
+    made = []
+    of = DifferentiableRollout.of
+    monkeypatch.setattr(DifferentiableRollout, "of", lambda *given: made.append(of(*given)) or made[-1])
     start = PretrainingConfig(gradient_steps=3, episodes=8, lags=4, batch_size=16)
     actors = []
     for devices in (1, 4):
         config = small("lag", pretraining=start, residual=True, steps=0, devices=devices)
         finals = train(Run.create(config, tmp_path / str(devices)))
         assert finals is not None
-        actors.append(finals[0].learner.actor)
-    assert [teacher.devices for teacher in taught] == [1, 4]
+        actors.append(finals[0].agent.actor)
+    assert [rollout.devices for rollout in made] == [1, 4]
     chex.assert_trees_all_close(*actors, atol=1e-5)
 
 

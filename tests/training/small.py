@@ -1,16 +1,29 @@
-"""A training run that takes seconds."""
+"""A training run that takes seconds, and options of the command for a smaller one."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 
-TINY = ["--pretraining.gradient-steps", "2", "--pretraining.episodes", "2", "--ddpg.hidden", "8", "8"]  # of the command
+TINY = [
+    "--pretraining.gradient-steps",
+    "2",
+    "--pretraining.episodes",
+    "2",
+    "--agent.hidden",
+    "8",
+    "8",
+]  # of the command
+
+
+def with_agent(config: TrainConfig, **changes) -> TrainConfig:
+    """The configuration with other settings of its agent."""
+    return replace(config, agent=replace(config.agent, **changes))
 
 
 def small(plant: str = "heaters", name: str = "default", **changes) -> TrainConfig:
     """8 environments, tiny networks, 3 epochs of which the last is shorter; episodes end within it."""
     base = preset(plant, name)
-    learner = replace(base.ddpg, hidden=(16, 16), batch_size=32, n_step=changes.pop("n_step", 1))
-    fields = dict(steps=3_040, prefill=640, epoch=960, environments=8, updates=1, replay=1_600, history=3)
-    fields |= dict(residual=False, pretraining=PretrainingConfig())
-    return replace(base, ddpg=learner, **{**fields, **changes})
+    of_agent = dict(hidden=(16, 16), batch_size=32, n_step=1, prefill=640, updates=1, replay=1_600)
+    of_agent |= {f.name: changes.pop(f.name) for f in fields(base.agent) if f.name in changes}
+    own = dict(steps=3_040, epoch=960, environments=8, history=3, residual=False, pretraining=PretrainingConfig())
+    return with_agent(replace(base, **{**own, **changes}), **of_agent)

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
-from jaxouter.loop.identify import EXPLORED, Dynamics
+from jaxouter.identification.identify import EXPLORED, Dynamics
 from jaxouter.plants import arx
 from jaxouter.plants.arx import Model
 from jaxouter.training.choice import choose, fitted
-from jaxouter.training.config import DEFAULT, from_dict, to_dict
+from jaxouter.training.config import from_dict, preset, to_dict
 from tests import kinds
 
 LATE = Dynamics(2, 40, 60.0, "stable", shown=True)
 PLANT, _ = kinds.late(40, episode_steps=200)()
+DEFAULT = preset("pitch")
 CONFIG = replace(DEFAULT, plant="kind")
 
 

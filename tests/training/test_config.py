@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter import plants
-from jaxouter.training.config import OWN, PRESETS, PretrainingConfig, from_dict, preset, to_dict
+from jaxouter import plants, tasks
+from jaxouter.training.config import PretrainingConfig, from_dict, preset, to_dict, with_options
 from tests import lag
+from tests.training.small import with_agent
 
-EVERY = [(plant, name) for plant, presets in PRESETS.items() for name in presets]
+EVERY = [(plant, name) for plant in tasks.TASKS for name in tasks.presets(plant)]
 
 
 @pytest.mark.parametrize(("plant", "name"), EVERY)
@@ -21,19 +22,19 @@ def test_presets_are_sound_and_survive_json(plant, name):
 @pytest.mark.parametrize(("plant", "steps"), [("pitch", 1000 * 200), ("heaters", 2000 * 200)])
 def test_paper_preset_is_the_papers(plant, steps):
     config = preset(plant, "paper")
-    assert (config.steps, config.environments, config.updates, config.replay) == (steps, 1, 1, 1_000_000)
-    assert (config.noise_theta, config.noise_sigma, config.residual, config.redraw) == (0.15, (0.2, 0.2), False, 0.0)
-    assert config.total_updates == steps - config.prefill
+    agent = config.agent
+    assert (config.steps, config.environments, agent.updates, agent.replay) == (steps, 1, 1, 1_000_000)
+    assert (agent.noise_theta, agent.noise_sigma, config.residual, config.redraw) == (0.15, (0.2, 0.2), False, 0.0)
+    assert config.total_updates == steps - agent.prefill
 
 
 def test_numbers_of_numpy_are_numbers():
     start = PretrainingConfig(gradient_steps=np.int32(3), noise=np.float32(0.1))
-    asked = dict(
-        seeds=np.int64(2), noise_sigma=[np.float32(0.1), jnp.asarray(0.2)], randomise=[["d1", np.float64(0), 1]]
-    )
-    config = replace(preset("pitch"), pretraining=start, **asked).check()
+    asked = dict(seeds=np.int64(2), randomise=[["d1", np.float64(0), 1]])
+    config = with_agent(preset("pitch"), noise_sigma=[np.float32(0.1), jnp.asarray(0.2)])
+    config = replace(config, pretraining=start, **asked).check()
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
-    assert (config.seeds, config.noise_sigma, config.pretraining.noise) == (2, (0.1, 0.2), 0.1)
+    assert (config.seeds, config.agent.noise_sigma, config.pretraining.noise) == (2, (0.1, 0.2), 0.1)
     with pytest.raises(ValueError, match="reward_scale is nan"):
         replace(preset("pitch"), reward_scale=np.float32("nan")).check()
 
@@ -46,12 +47,15 @@ def test_numbers_of_numpy_are_numbers():
         ({"seeds": 0}, "seeds is 0; it must be positive"),
         ({"seed": -1}, "seed is -1; it must not be negative"),
         ({"epoch": 100}, "epoch is 100; it must be a multiple of the 16 environments"),
-        ({"replay": 100}, "replay is 100; it must hold at least a batch of 256"),
+        ({"agent.replay": 100}, "agent.replay is 100; it must hold at least a batch of 256"),
         ({"devices": 0}, "devices is 0; it must be positive"),
         ({"seeds": 3, "devices": 2}, "devices is 2 and seeds is 3; one must be a multiple of the other"),
         ({"devices": 32}, "environments is 16; it must be a multiple of the 32 devices that each of the 1 seeds gets"),
-        ({"prefill": 160}, "prefill is 160; it must be at least the batch size, 256"),
-        ({"steps": 8_000}, "prefill is 8000; it must be at least the batch size, 256 and less than the 8000 steps"),
+        ({"agent.prefill": 160}, "agent.prefill is 160; it must be at least the batch size, 256"),
+        (
+            {"steps": 8_000},
+            "agent.prefill is 8000; it must be at least the batch size, 256 and less than the 8000 steps",
+        ),
         ({"pretraining": PretrainingConfig()}, "steps is 0; it must be positive, or 0 with pretraining"),
         ({"pretraining": PretrainingConfig(1, plants=2)}, "pretraining.plants is 2; without randomise it must be 1"),
         (
@@ -59,12 +63,15 @@ def test_numbers_of_numpy_are_numbers():
             "pretraining.episodes is 64; it must be a multiple of the 3 plants",
         ),
         ({"redraw": 1.5}, "redraw is 1.5"),
-        ({"noise_sigma": (0.0, 0.1)}, r"noise_sigma is \(0.0, 0.1\)"),
+        ({"agent.noise_sigma": (0.0, 0.1)}, r"agent.noise_sigma is \(0.0, 0.1\)"),
+        ({"agent.speed": 1}, "there is no option 'agent.speed'; there are: agent.hidden, agent.layer_norm,"),
+        ({"speed": 1}, "there is no option 'speed'; there are: plant, preset, agent,"),
+        ({"agent": "ddpg"}, "there is no option 'agent'; there are: plant"),
     ],
 )
 def test_errors_name_field_value_and_what_is_allowed(change, text):
     with pytest.raises(ValueError, match=text):
-        replace(preset("pitch"), **change).check()
+        with_options(preset("pitch"), change).check()
 
 
 def test_unknown_preset_lists_those_that_exist():
@@ -74,8 +81,8 @@ def test_unknown_preset_lists_those_that_exist():
 
 def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
     monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
-    for name in OWN:
-        assert preset("lag", name).check() == replace(OWN[name], plant="lag")
+    for name in ("default", "paper"):
+        assert preset("lag", name).check() == replace(preset("pitch", name), plant="lag")
     with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, paper"):
         preset("lag", "robust")
 
@@ -85,17 +92,11 @@ def test_configuration_with_an_unknown_field_is_refused():
         from_dict({**to_dict(preset("pitch")), "speed": 3})
 
 
-def test_configuration_of_before_there_were_devices_has_one():
-    values = to_dict(preset("pitch"))
-    del values["devices"]
-    assert from_dict(values) == preset("pitch")
-
-
 def test_ranges_survive_json():
     config = replace(preset("pitch"), randomise=(("gain", 0.8, 1.2), ("d1", 0.0, 0.7)))
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
 
 
 def test_last_epoch_may_be_shorter():
-    config = replace(preset("pitch"), steps=8_000 + 6_400 + 160, prefill=8_000, epoch=6_400)
+    config = replace(preset("pitch"), steps=8_000 + 6_400 + 160, epoch=6_400)
     assert config.epochs == 2

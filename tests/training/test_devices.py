@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.agents.ddpg import DDPG, Batch, DDPGConfig
+from jaxouter.agents.agent import Transitions
+from jaxouter.agents.ddpg import DDPG, DDPGConfig
 from jaxouter.train import parse
 from jaxouter.training.devices import Processes
 from jaxouter.training.run import Run
@@ -23,8 +24,19 @@ from tests.precision import of_single_draws
 from tests.training.small import small
 
 HERE = Path(__file__).parent
-OPTIONS = ["--steps", "1040", "--prefill", "640", "--epoch", "8", "--environments", "8", "--replay", "1600"]
-OPTIONS += ["--history", "3", "--ddpg.hidden", "16", "16", "--ddpg.batch-size", "32", "--updates", "1", "--no-residual"]
+OPTIONS = ["--steps", "1040", "--agent.prefill", "640", "--epoch", "8", "--environments", "8", "--agent.replay", "1600"]
+OPTIONS += [
+    "--history",
+    "3",
+    "--agent.hidden",
+    "16",
+    "16",
+    "--agent.batch-size",
+    "32",
+    "--agent.updates",
+    "1",
+    "--no-residual",
+]
 OPTIONS += ["--pretraining.gradient-steps", "0"]
 
 
@@ -46,7 +58,7 @@ def test_on_four_forced_devices():
 def test_gradients_of_parts_of_a_batch_average_to_that_of_the_whole():
     config = DDPGConfig(hidden=(16, 16))
     keys = jax.random.split(jax.random.key(0), 5)
-    batch = Batch(
+    batch = Transitions(
         *(jax.random.normal(key, shape) for key, shape in zip(keys, [(8, 3), (8, 1), (8,), (8,), (8, 3)], strict=True))
     )
     whole, parts = DDPG(config, 3), DDPG(config, 3, axis="parts")
@@ -138,10 +150,10 @@ def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
 
     runs = [Run.open(tmp_path / name) for name in ("together", "apart")]
     together, apart = (run.load(0)[0] for run in runs)
-    assert int(apart.learner.updates) == 50
+    assert int(apart.agent.updates) == 50
     assert [row["epoch"] for row in runs[1].rows(0)] == list(range(1, 51))
-    first, last = runs[0].trainer[0].replay.mirror, runs[0].trainer[0].replay.mirror + 640 // 8
-    np.testing.assert_array_equal(together.replay.rows[:, first:last], apart.replay.rows[:, first:last])
+    first, last = runs[0].trainer[0].driver.replay.mirror, runs[0].trainer[0].driver.replay.mirror + 640 // 8
+    np.testing.assert_array_equal(together.data.rows[:, first:last], apart.data.rows[:, first:last])
     keys = [
         [
             jax.random.key_data(leaf)
@@ -152,4 +164,4 @@ def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
     ]
     assert len(keys[0]) > 1
     chex.assert_trees_all_equal(*keys)
-    chex.assert_trees_all_close(together.learner, apart.learner, rtol=1e-4, atol=1e-7)
+    chex.assert_trees_all_close(together.agent, apart.agent, rtol=1e-4, atol=1e-7)

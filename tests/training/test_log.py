@@ -8,8 +8,8 @@ import jax
 import pytest
 
 from jaxouter import plants
-from jaxouter.evaluation.rivals.tuning import score, training_episodes
-from jaxouter.loop import identify, log
+from jaxouter.evaluation.baselines.tuning import score, training_episodes
+from jaxouter.identification import identify, recorded_data
 from jaxouter.loop.policy import none
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.trainer import build
@@ -27,7 +27,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_controller_from_a_log_is_better_on_the_true_plant(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: log.make("logged", str(path)))
+    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: recorded_data.make("logged", str(path)))
     config = small("logged", pretraining=START, residual=True, steps=0)
     assert config.identification_steps == 0  # of the plant nothing more is asked
     trainer, params = build(config)

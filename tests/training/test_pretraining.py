@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
-from jaxouter.evaluation.rivals.tuning import score, training_episodes
-from jaxouter.loop import counterfactual, identify
+from jaxouter.evaluation.baselines.tuning import score, training_episodes
+from jaxouter.identification import counterfactual, identify
 from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
-from jaxouter.training.pretraining import ADAM, Teacher, Whitening
+from jaxouter.training.epochs import train
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout, Whitening
 from jaxouter.training.run import Run, RunWarning
-from jaxouter.training.train import train
 from jaxouter.training.trainer import build
 from tests import lag
-from tests.training.small import small
+from tests.training.small import small, with_agent
 
 KEY = jax.random.key(0)
 START = PretrainingConfig(gradient_steps=100, episodes=8, lags=4, batch_size=16)
@@ -40,24 +40,24 @@ def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
 
     def report(at, so_far):
         heard.append(int(at.done))
-        actors.append(so_far().learner.actor)
+        actors.append(so_far().agent.actor)
 
     state = trainer.start(0, params, report, say=lambda *what: begun.append(what))
     assert heard == [50, 100]
     assert list(dict.fromkeys(what for what, _, _ in begun)) == ["compiling", "recording"]
-    jax.tree.map(np.testing.assert_array_equal, actors[-1], state.learner.actor)
+    jax.tree.map(np.testing.assert_array_equal, actors[-1], state.agent.actor)
     assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, actors), strict=True))
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
     assert reached > 0.95 * score(*identify.static(plant, of_plant, jax.random.key(0)), episodes)  # both negative
-    jax.tree.map(np.testing.assert_array_equal, state.learner.actor, state.learner.target_actor)
+    jax.tree.map(np.testing.assert_array_equal, state.agent.actor, state.agent.target_actor)
 
 
 def test_the_same_seed_gives_the_same_actor(config):
     trainer, params = build(config)
     jax.tree.map(
-        np.testing.assert_array_equal, trainer.start(3, params).learner.actor, trainer.start(3, params).learner.actor
+        np.testing.assert_array_equal, trainer.start(3, params).agent.actor, trainer.start(3, params).agent.actor
     )
 
 
@@ -75,9 +75,11 @@ def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
 
 @pytest.mark.slow
 def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config, monkeypatch):
-    lengths, learn = [], Teacher.train
+    lengths, learn = [], DifferentiableRollout.train
     monkeypatch.setattr(
-        Teacher, "train", lambda self, *given: lengths.append(self.plant.episode_steps) or learn(self, *given)
+        DifferentiableRollout,
+        "train",
+        lambda self, *given: lengths.append(self.plant.episode_steps) or learn(self, *given),
     )
     start = replace(START, gradient_steps=150, episode_steps=80, log_above=0.1)
     config = replace(config, pretraining=start)
@@ -97,10 +99,10 @@ def test_where_the_loop_collapses_training_goes_back_and_on_at_half_the_rate(con
         greater.setattr(pretraining, "RATE", 100.0)
         heard = []
         trainer.start(0, params, lambda at, state: heard.append(at))
-    assert [float(at.trust) for at in heard] == [0.5, 0.25]
+    assert [float(at.rate_scale) for at in heard] == [0.5, 0.25]
     chex.assert_trees_all_equal(*(x for at in heard for x in (at.before, at.now)))
     trainer.start(0, params, lambda at, state: heard.append(at), heard[0])
-    assert float(heard[-1].trust) == 0.5 * 1.25
+    assert float(heard[-1].rate_scale) == 0.5 * 1.25
     chex.assert_trees_all_equal(heard[-1].before, heard[0].now)
 
 
@@ -108,14 +110,14 @@ def test_costs_count_by_their_logarithm_where_asked(config):
     """The reward with which a step on one episode begins."""
     trainer, _ = build(config)
     model = counterfactual.fit(identify.record(*lag.make(), KEY, 8), 4)
-    of_record, prior = counterfactual.plant(trainer.env.plant, 4), identify.static(*lag.make(), KEY)[1]
-    actors = jax.tree.map(lambda leaf: leaf[None], trainer.learner.init(KEY).actor)
+    of_record, base = counterfactual.plant(trainer.env.plant, 4), identify.static(*lag.make(), KEY)[1]
+    actors = jax.tree.map(lambda leaf: leaf[None], trainer.agent.init(KEY).actor)
     white = Whitening(np.zeros(trainer.env.observer.size), np.eye(trainer.env.observer.size))
 
     def cost(log_above):
-        school = Teacher(of_record, trainer.policy, 1, log_above=log_above)
+        school = DifferentiableRollout(of_record, trainer.policy, 1, log_above=log_above)
         return -float(
-            school.train((actors, jax.vmap(ADAM.init)(actors)), white, prior, model, np.zeros(1), KEY)[1][0, 0]
+            school.train((actors, jax.vmap(ADAM.init)(actors)), white, base, model, np.zeros(1), KEY)[1][0, 0]
         )
 
     assert cost(0.1) == pytest.approx(0.1 * np.log1p(cost(0.0) / 0.1), rel=1e-4)
@@ -123,7 +125,7 @@ def test_costs_count_by_their_logarithm_where_asked(config):
 
 def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
     trainer, _ = build(config)
-    school = Teacher(trainer.env.plant, trainer.policy, noise=0.5, load=0.5)
+    school = DifferentiableRollout(trainer.env.plant, trainer.policy, noise=0.5, load=0.5)
     keys = jax.random.split(jax.random.key(0), 400)
     noise = np.asarray(jax.vmap(lambda key: school._noise(key, 50))(keys))
     level = noise.std(1)
@@ -143,7 +145,7 @@ def test_a_run_may_end_with_the_start(config, tmp_path):
     assert config.epochs == 0
     assert [row["epoch"] for row in run.rows(0)] == [0]
     again = train(Run.open(run.path), pretrained=lambda *_: pytest.fail("pretrained again"))
-    jax.tree.map(np.testing.assert_array_equal, finals[0].learner.actor, again[0].learner.actor)
+    jax.tree.map(np.testing.assert_array_equal, finals[0].agent.actor, again[0].agent.actor)
 
 
 def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
@@ -163,7 +165,7 @@ def test_a_start_that_was_stopped_goes_on_where_it_was(config, tmp_path):
     resumed = train(Run.open(stopped.path), pretrained=lambda seed, at, look: heard.append(int(at.done)))
     assert heard == [100]
     chex.assert_trees_all_equal(finals, resumed)
-    assert stopped.load_rehearsal(0) is None
+    assert stopped.load_pretraining(0) is None
 
 
 def test_a_damaged_first_checkpoint_is_made_again(config, tmp_path):
@@ -189,13 +191,13 @@ def test_a_damaged_start_begins_anew(config, tmp_path):
 @pytest.mark.slow
 def test_the_actor_waits_until_the_critic_has_learned():
     config = small("lag", prefill=640, steps=640 + 8 * 20)
-    trainer, params = build(replace(config, ddpg=replace(config.ddpg, actor_from=10)))
+    trainer, params = build(with_agent(config, actor_from=10))
     state = trainer.prefill(trainer.start(0, params), params)
-    before = jax.tree.map(np.asarray, state.learner.actor)
+    before = jax.tree.map(np.asarray, state.agent.actor)
     state, _ = trainer.epoch(state, params, 80)
-    jax.tree.map(np.testing.assert_array_equal, before, state.learner.actor)
+    jax.tree.map(np.testing.assert_array_equal, before, state.agent.actor)
     state, _ = trainer.epoch(state, params, 8)
-    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (before, state.learner.actor)), strict=True))
+    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (before, state.agent.actor)), strict=True))
 
 
 def test_a_model_longer_than_half_an_episode_is_refused(config):

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from jaxouter.training.devices import Fleet
-from jaxouter.training.trainer import DIAGNOSIS, EPISODES, FIELDS, build
+from jaxouter.training.environments import EPISODES
+from jaxouter.training.off_policy import FIELDS
+from jaxouter.training.trainer import DIAGNOSIS, build
 from tests.precision import X64, makes_nan
 from tests.training.small import small
 
@@ -28,9 +30,9 @@ def copy(state):
 def test_prefill_fills_and_does_not_learn(filled):
     trainer, params, state = filled
     assert int(state.steps) == 640
-    assert int(state.replay.written) == 640 // 8
-    assert int(state.learner.updates) == 0
-    chex.assert_trees_all_equal(state.learner, trainer.start(0, params).learner)
+    assert int(state.data.written) == 640 // 8
+    assert int(state.agent.updates) == 0
+    chex.assert_trees_all_equal(state.agent, trainer.start(0, params).agent)
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
@@ -38,11 +40,11 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
     """Windows of signals rebuild exactly what was seen, across resets, truncation and the ring's end included."""
     trainer, params = build(small(n_step=n_step, epoch=800, steps=1_600, replay=960))
     state = trainer.start(0, params)
-    step, write = jax.jit(trainer.vector_step), jax.jit(trainer.replay.write)
+    step, write = jax.jit(trainer.environments.step), jax.jit(trainer.driver.replay.write)
 
     @jax.jit
     def without_reset(state, action, keys):
-        r_tilde = jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(state.prior, state.env.r, action)
+        r_tilde = jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(state.base, state.env.r, action)
         return jax.vmap(trainer.env.step_env, (0, 0, 0, None))(keys, state.env, r_tilde, params)
 
     seen = []  # (obs, action, reward, terminated, truncated, final observation) of each step
@@ -51,19 +53,19 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
         action, keys = jax.random.uniform(key, (8,), minval=-1.0), jax.random.split(key, 8)
         before = state.obs
         final = without_reset(state, action, keys)
-        state, rows, reward, _ = step(state, params, action, keys)
-        state = state._replace(replay=write(state.replay, rows))
-        seen.append((before, action, reward, final[3], final[4], final[5]["final_observation"]))
+        state, taken = step(state, params, action, keys)
+        state = state._replace(data=write(state.data, trainer.driver.row(taken)))
+        seen.append((before, action, taken.plant_reward, final[3], final[4], final[5]["final_observation"]))
     assert any(bool(ended.any()) for *_, ended, _ in seen)
     obs, action, reward, terminated, truncated, final = (np.asarray(jnp.stack(x)) for x in zip(*seen, strict=True))
-    gamma = trainer.config.ddpg.discount
+    gamma = trainer.config.agent.discount
 
-    bits = jax.random.bits(jax.random.key(0), (trainer.config.ddpg.batch_size, 2), jnp.uint32)
-    batch = trainer.batch(state.replay, bits)
-    rows, _ = trainer.replay.sample(state.replay, bits)
+    bits = jax.random.bits(jax.random.key(0), (trainer.config.agent.batch_size, 2), jnp.uint32)
+    batch = trainer.driver.batch(state.data, bits)
+    rows, _ = trainer.driver.replay.sample(state.data, bits)
     for i, row in enumerate(np.asarray(rows)):
         match = np.argwhere(
-            np.isclose(np.float32(action), row[trainer.replay.lead, FIELDS.index("action")], rtol=0, atol=0)
+            np.isclose(np.float32(action), row[trainer.driver.replay.lead, FIELDS.index("action")], rtol=0, atol=0)
         )
         t, e = match[0]
         total, k = reward[t, e], 0
@@ -83,8 +85,8 @@ def test_scan_equals_a_python_loop(filled):
     looped = copy(state)
     for _ in range(10):
         looped, _ = trainer.epoch(looped, params, 8)
-    chex.assert_trees_all_close(scanned.learner, looped.learner, atol=1e-6)
-    chex.assert_trees_all_close(scanned.replay, looped.replay, atol=1e-5)
+    chex.assert_trees_all_close(scanned.agent, looped.agent, atol=1e-6)
+    chex.assert_trees_all_close(scanned.data, looped.data, atol=1e-5)
     chex.assert_trees_all_equal(scanned.steps, looped.steps)
 
 
@@ -108,9 +110,9 @@ def test_same_seed_twice_is_bit_equal_and_another_seed_is_not(config):
     first, second, other = (
         trainer.epoch(trainer.prefill(trainer.start(seed, params), params), params, 80)[0] for seed in (0, 0, 1)
     )
-    chex.assert_trees_all_equal(first.learner, second.learner)
-    chex.assert_trees_all_equal(first.replay, second.replay)
-    assert not np.array_equal(jax.tree.leaves(first.learner.actor)[0], jax.tree.leaves(other.learner.actor)[0])
+    chex.assert_trees_all_equal(first.agent, second.agent)
+    chex.assert_trees_all_equal(first.data, second.data)
+    assert not np.array_equal(jax.tree.leaves(first.agent.actor)[0], jax.tree.leaves(other.agent.actor)[0])
 
 
 @pytest.mark.slow
@@ -123,8 +125,8 @@ def test_vmapped_seeds_equal_single_runs():
     for i in range(2):
         one = fresh(keys[i], params)
         one, _ = trainer.epoch(trainer.prefill(one, params), params, 80)
-        lane = jax.tree.map(lambda leaf, i=i: leaf[i], both.learner)
-        chex.assert_trees_all_close(lane, one.learner, atol=1e-4)
+        lane = jax.tree.map(lambda leaf, i=i: leaf[i], both.agent)
+        chex.assert_trees_all_close(lane, one.agent, atol=1e-4)
 
 
 @pytest.mark.skipif(X64, reason="the replay is single precision, for a learner that is")
@@ -132,7 +134,7 @@ def test_compiled_epoch_copies_no_replay_inside_its_loop(filled):
     _, params, state = filled
     fleet = Fleet.of(SMALL)
     text = fleet.epoch.lower(fleet.put([state]), params, 80).compile().as_text()
-    shape = ",".join(map(str, state.replay.rows.shape))
+    shape = ",".join(map(str, state.data.rows.shape))
     lines = [line for line in text.splitlines() if f"f32[{shape}]" in line or f"f32[1,{shape}]" in line]
     assert lines
     assert sum(" copy(" in line for line in lines) <= 1  # where the loop begins, once an epoch
@@ -144,13 +146,13 @@ def test_an_epoch_of_a_fleet_is_one_of_its_trainer(filled):
     fleet = Fleet.of(SMALL)
     found, _ = fleet.epoch(fleet.put([copy(state)]), params, 80)
     expected, _ = trainer.epoch(copy(state), params, 80)
-    chex.assert_trees_all_close(jax.tree.map(lambda leaf: leaf[0], found.learner), expected.learner, atol=1e-6)
+    chex.assert_trees_all_close(jax.tree.map(lambda leaf: leaf[0], found.agent), expected.agent, atol=1e-6)
 
 
 def test_exploration_stays_within_the_bounds_of_r_tilde():
     loud, params = build(small(noise_sigma=(3.0, 3.0)))
     state, _ = loud.epoch(loud.prefill(loud.start(0, params), params), params, 960)
-    r_tilde = state.replay.rows[:, :, FIELDS.index("r_tilde")]
+    r_tilde = state.data.rows[:, :, FIELDS.index("r_tilde")]
     assert float(r_tilde.min()) == 0.0
     assert float(r_tilde.max()) == 40.0
 
@@ -162,20 +164,20 @@ def test_a_plant_that_diverges_never_poisons_the_replay():
     assert float(metrics["diverged"]) > 0.02
     assert float(metrics["skipped"]) == float(metrics["no_action"]) == 0.0
     low, high = trainer.env.plant.divergence_bounds
-    y = np.asarray(state.replay.rows[..., FIELDS.index("y_next")])
+    y = np.asarray(state.data.rows[..., FIELDS.index("y_next")])
     assert ((y == low) | (y == high)).any()
     assert ((y >= low) & (y <= high)).all()
-    chex.assert_tree_all_finite((state.replay.rows, state.learner, state.obs, metrics))
+    chex.assert_tree_all_finite((state.data.rows, state.agent, state.obs, metrics))
 
 
 @makes_nan
 def test_actions_that_are_not_finite_become_zero_and_are_counted(filled):
     trainer, params, state = filled
     state = copy(state)
-    actor = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.learner.actor)
-    state, metrics = trainer.epoch(state._replace(learner=state.learner._replace(actor=actor)), params, 80)
+    actor = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.agent.actor)
+    state, metrics = trainer.epoch(state._replace(agent=state.agent._replace(actor=actor)), params, 80)
     assert float(metrics["no_action"]) == float(metrics["skipped"]) == 1.0
-    chex.assert_tree_all_finite((state.replay.rows, state.obs, state.env.y, state.learner.critics))
+    chex.assert_tree_all_finite((state.data.rows, state.obs, state.env.y, state.agent.critics))
 
 
 def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes(filled):
@@ -187,8 +189,8 @@ def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes(filled):
     assert float(found["replay_age"]) == 8 * (80 - 1) / 2  # of 720 steps of 8 environments the replay holds 640
     assert float(found["critic_gradient"]) > 0
     # Of a zero actor and critic the return is that of constant r~, 20 degC.
-    actor, critics = (jax.tree.map(jnp.zeros_like, part) for part in (state.learner.actor, state.learner.critics))
-    blind = trainer.diagnose(state._replace(learner=state.learner._replace(actor=actor, critics=critics)), params)
+    actor, critics = (jax.tree.map(jnp.zeros_like, part) for part in (state.agent.actor, state.agent.critics))
+    blind = trainer.diagnose(state._replace(agent=state.agent._replace(actor=actor, critics=critics)), params)
     assert float(blind["q_start"]) == 0.0
     key = jax.random.split(jax.random.fold_in(state.key, DIAGNOSIS), 3)[2]
 
@@ -205,22 +207,22 @@ def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes(filled):
         return jax.lax.scan(step, env, jax.random.split(of_run, trainer.env.plant.episode_steps))[1]
 
     each = np.asarray(rewards(jax.random.split(key, EPISODES)))
-    returns = 0.5 * each @ trainer.config.ddpg.discount ** np.arange(each.shape[1])
+    returns = 0.5 * each @ trainer.config.agent.discount ** np.arange(each.shape[1])
     assert float(blind["return_start"]) == pytest.approx(np.mean(returns), rel=1e-4)
 
 
 def test_residual_starts_at_the_static_prefilter():
     trainer, params = build(small("pitch", residual=True))
     state = trainer.start(0, params)
-    assert float(state.prior.slope) == pytest.approx(3.0, rel=0.02)
-    r_tilde = trainer.policy.r_tilde(state.prior, jnp.array(10.0), jnp.array(0.0))
+    assert float(state.base.slope) == pytest.approx(3.0, rel=0.02)
+    r_tilde = trainer.policy.r_tilde(state.base, jnp.array(10.0), jnp.array(0.0))
     assert float(r_tilde) == pytest.approx(30.0, rel=0.02)
 
 
 def test_set_points_are_redrawn_within_an_episode_only_where_asked():
     for redraw, changes in ((0.0, False), (0.5, True)):
         trainer, params = build(replace(SMALL, redraw=redraw))
-        rows = trainer.prefill(trainer.start(0, params), params).replay.rows[:, trainer.replay.mirror :][:, :80]
+        rows = trainer.prefill(trainer.start(0, params), params).data.rows[:, trainer.driver.replay.mirror :][:, :80]
         r, age = rows[..., FIELDS.index("r")], rows[..., FIELDS.index("age")]
         within = (age[:, 1:] > 0) & (r[:, 1:] != r[:, :-1])
         assert bool(within.any()) == changes

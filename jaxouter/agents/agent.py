@@ -1,0 +1,221 @@
+"""What a learner is, and the data it learns from. It knows nothing of plants, files or devices.
+
+Its small functions are unbatched; the drivers in `jaxouter.training` vmap them. Whatever it learns, what acts in the
+end is one MLP, `jaxouter.agents.networks.Actor`, followed by tanh: exports, pretraining, stability analysis and the
+live loop need nothing else of a learner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import chex
+import jax
+
+
+@dataclass(frozen=True)
+class OffPolicy:
+    """Learns from transitions in a replay, whoever acted."""
+
+    batch_size: int
+    """Transitions an update."""
+    n_step: int
+    """Steps of the return before it is bootstrapped."""
+    discount: float
+    """Discount a control step."""
+    updates: int
+    """After each step of all environments."""
+    prefill: int
+    """Environment steps with random actions before the first update."""
+    replay: int
+    """Environment steps that the replay holds."""
+
+    @property
+    def before(self) -> int:
+        """Environment steps before the first epoch."""
+        return self.prefill
+
+    def total_updates(self, steps: int, environments: int) -> int:
+        """Updates in so many environment steps, those before the first epoch included."""
+        return max(0, steps - self.prefill) // environments * self.updates
+
+    def check(self, steps: int, epoch: int, environments: int, shards: int) -> None:
+        """Whether a training of this shape can be.
+
+        Raises:
+            ValueError: names the field, its value and what is allowed.
+        """
+        if self.batch_size % shards:
+            raise ValueError(
+                f"agent.batch_size is {self.batch_size}; it must be a multiple of the {shards} devices of each seed"
+            )
+        for name, value in (("agent.prefill", self.prefill), ("epoch", epoch)):
+            _multiple(name, value, environments, f"the {environments} environments")
+        if self.prefill < self.batch_size or 0 < steps <= self.prefill:
+            most = f" and less than the {steps} steps" if steps else ""
+            raise ValueError(
+                f"agent.prefill is {self.prefill}; it must be at least the batch size, {self.batch_size}{most}"
+            )
+        if self.prefill <= self.n_step * environments:
+            raise ValueError(
+                f"agent.prefill is {self.prefill}; it must hold more than agent.n_step = {self.n_step} steps of each "
+                "environment"
+            )
+        if self.replay < self.batch_size:
+            raise ValueError(f"agent.replay is {self.replay}; it must hold at least a batch of {self.batch_size}")
+
+
+@dataclass(frozen=True)
+class OnPolicy:
+    """Learns from what the present policy has just done."""
+
+    unroll: int
+    """Steps of each environment between updates."""
+    epochs: int
+    """Passes over these."""
+    minibatches: int
+    """Parts of each pass, an update each."""
+    discount: float
+    """Discount a control step."""
+    gae_lambda: float
+    """Decay of advantages (Schulman et al. 2016); 1: the whole return."""
+
+    @property
+    def before(self) -> int:
+        """Environment steps before the first epoch."""
+        return 0
+
+    def total_updates(self, steps: int, environments: int) -> int:
+        """Updates in so many environment steps."""
+        return steps // (self.unroll * environments) * self.epochs * self.minibatches
+
+    def check(self, steps: int, epoch: int, environments: int, shards: int) -> None:
+        """Whether a training of this shape can be.
+
+        Raises:
+            ValueError: names the field, its value and what is allowed.
+        """
+        each = self.unroll * environments
+        for name, value in (("epoch", epoch), ("steps", steps)):
+            _multiple(name, value, each, f"{each}: agent.unroll = {self.unroll} steps of {environments} environments")
+        _multiple("agent.unroll times environments", each // shards, self.minibatches, "agent.minibatches")
+
+
+def _multiple(name: str, value: int, of: int, what: str) -> None:
+    if value % of:
+        raise ValueError(f"{name} is {value}; it must be a multiple of {what}")
+
+
+class AgentConfig:
+    """Marks the settings of a learner: a frozen dataclass, whose fields are the options `--agent.*`.
+
+    Among them is `hidden`, the widths of the actor's hidden layers.
+    """
+
+    hidden: tuple[int, ...]
+
+    @property
+    def data(self) -> OffPolicy | OnPolicy:
+        """What it learns from."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raises ValueError, naming field, value and what is allowed."""
+
+    def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> Agent:
+        """The learner.
+
+        Args:
+            obs_size: length of an observation.
+            total_updates: of the training, for schedules.
+            axis: mapped axis over which gradients are averaged, where each member updates on its part of the batch.
+        """
+        raise NotImplementedError
+
+
+class Transitions(NamedTuple):
+    """What an off-policy learner updates from, (B, ...)."""
+
+    obs: jax.Array  # (B, n)
+    action: jax.Array  # (B, m), in [-1, 1]
+    reward: jax.Array  # (B,), discounted sum over the n steps
+    discount: jax.Array  # (B,), of the bootstrapped value; 0 where terminated
+    next_obs: jax.Array  # (B, n)
+
+
+class Experience(NamedTuple):
+    """What an on-policy learner updates from, (B, ...)."""
+
+    obs: jax.Array  # (B, n)
+    action: jax.Array  # (B, m), in [-1, 1]
+    extras: Any  # as `explore` gave them
+    advantage: jax.Array  # (B,), generalised, not normalised
+    value_target: jax.Array  # (B,)
+
+
+class Agent(Protocol):
+    """A learner. Frozen and hashable; its state is a pytree."""
+
+    @property
+    def data(self) -> OffPolicy | OnPolicy:
+        """What it learns from."""
+        ...
+
+    def init(self, key: chex.PRNGKey) -> Any:
+        """State before the first update."""
+        ...
+
+    def actor(self, state: Any) -> Any:
+        """Parameters of the one MLP that acts."""
+        ...
+
+    def with_actor(self, state: Any, actor: Any) -> Any:
+        """The state with another actor, targets and all."""
+        ...
+
+    def noise(self, environments: int) -> Any:
+        """What exploration remembers, each leaf (E, ...)."""
+        ...
+
+    def explore(
+        self, state: Any, noise: Any, obs: jax.Array, normal: jax.Array, first: jax.Array, progress: jax.Array
+    ) -> tuple[jax.Array, Any, Any]:
+        """An action of one environment, with exploration.
+
+        Args:
+            state: learner.
+            noise: of this environment.
+            obs: (n,).
+            normal: standard normal numbers (m,), so that none are drawn in the loop.
+            first: bool, whether an episode begins.
+            progress: share of the training that is over.
+
+        Returns:
+            action (m,) in [-1, 1], the next noise, and extras: what an on-policy learner wants back beside them.
+        """
+        ...
+
+    def update(self, state: Any, batch: Any, key: chex.PRNGKey) -> tuple[Any, dict[str, jax.Array]]:
+        """One gradient step on `Transitions` or `Experience`; metrics are scalars."""
+        ...
+
+    def value(self, state: Any, obs: jax.Array) -> jax.Array:
+        """Discounted return that it expects from obs (..., n) on; (...)."""
+        ...
+
+
+class OffPolicyAgent(Agent, Protocol):
+    """What the off-policy driver and the live loop need beside that."""
+
+    def diagnose(self, state: Any, batch: Transitions, key: chex.PRNGKey) -> dict[str, jax.Array]:
+        """What tells on one batch whether the learning is sound, such as norms of gradients."""
+        ...
+
+    def endless(self, warm_up: int) -> OffPolicyAgent:
+        """The same learner for a loop without end, whose actor stays as it is for so many updates."""
+        ...
+
+    def restarted(self, state: Any) -> Any:
+        """The same networks, with targets, optimisers and counters anew."""
+        ...

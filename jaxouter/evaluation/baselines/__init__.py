@@ -1,0 +1,127 @@
+"""The policies that the learned one is compared with: what an engineer would do in its place, and the limits.
+
+Each is identified and tuned on the training distribution, through r~ and y alone, by the same figure that the learner
+maximises, the return; `oracle` and `clairvoyant` know more and say what is possible at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import cache as cache_of_functions
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.evaluation import cache
+from jaxouter.evaluation.baselines import deepc, inverse, mpc, oracle, pi
+from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.identification import identify
+from jaxouter.loop.policy import Affine, AffineParams, Policy
+from jaxouter.plants import Plant, make
+from jaxouter.plants.registry import attribute
+
+Kind = Literal["baseline", "limit", "preview", "learned", "user"]
+CLAIRVOYANT = "clairvoyant"
+OWN = "a policy of your own"
+
+
+class Baseline(NamedTuple):
+    """How a policy comes about."""
+
+    kind: Kind
+    tune: Callable[[Plant, Any, chex.PRNGKey, int, Report], Tuned]
+    build: Callable[[Plant, Tuned], tuple[Policy, Any]]
+    note: str
+
+
+def _none(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    return Tuned({"slope": 1.0, "offset": 0.0}, {}, 0)
+
+
+def _static(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    identified = identify.dc_gain(plant, params, key)
+    _, found = identify.prefilter(plant, identified)
+    settings = {"slope": float(found.slope), "offset": float(found.offset), "unsettled": identified.unsettled}
+    return Tuned(settings, {}, identify.LEVELS * plant.episode_steps)
+
+
+def _affine(plant: Plant, tuned: Tuned) -> tuple[Policy, Any]:
+    identify.warn_unsettled(tuned.settings.get("unsettled"))
+    slope, offset = (jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset"))
+    return Affine(plant.r_tilde_bounds), AffineParams(slope, offset)
+
+
+BASELINES: dict[str, Baseline] = {
+    "none": Baseline("baseline", _none, _affine, "The inner loop alone: r~ = r."),
+    "static": Baseline(
+        "baseline", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes; r~ = r without one."
+    ),
+    "pi": Baseline("baseline", pi.tune, pi.build, "Static prefilter and PI with anti-windup, gains by COBYQA."),
+    "mpc": Baseline(
+        "baseline",
+        mpc.tune,
+        mpc.build,
+        "ARX model with dead time, observer with input disturbance, QP over r~ and its moves.",
+    ),
+    "deepc": Baseline(
+        "baseline", deepc.tune, deepc.build, "Data-enabled predictive control on a record, without a model."
+    ),
+    "inverse": Baseline(
+        "baseline", inverse.tune, inverse.build, "Network that learned r~ from past and future y, without preview."
+    ),
+    "oracle": Baseline(
+        "limit", oracle.tune, oracle.build, "The learner's actor, trained by back-propagation through the simulator."
+    ),
+}
+NAMES = (*BASELINES, CLAIRVOYANT)
+BUDGET = 128_000  # environment steps that identification and tuning of a baseline may take
+SIMPLE = ("none", "static")  # what costs next to nothing
+
+
+def identified(name: str, plant_name: str, report: Report = lambda text, share: None) -> Tuned:
+    """What identification and tuning of a baseline found on the nominal plant, once for all: it is kept in the cache.
+
+    `report` is called where it is not there, at the beginning first.
+
+    Raises:
+        ValueError: there is no such plant or baseline, or the identification failed.
+    """
+    known, file = resolve(name), _file(name)
+    plant, params = make(plant_name)
+
+    def tune() -> Tuned:
+        report("", 0.0)
+        return known.tune(plant, params, jax.random.key(0), BUDGET, report)
+
+    key: dict[str, Any] = {"budget": BUDGET}
+    if file is not None:
+        key |= {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    return cache.cached(f"{plant_name}-{name.rpartition(':')[2]}", key, tune)
+
+
+@cache_of_functions
+def resolve(name: str) -> Baseline:
+    """The baseline of that name, or that of one's own which FILE.py:NAME is.
+
+    Raises:
+        ValueError: there is no such baseline.
+    """
+    file = _file(name)
+    if file is None:
+        if name not in BASELINES:
+            raise ValueError(f"there is no policy {name!r}; the policies are: {', '.join(BASELINES)}, and FILE.py:NAME")
+        return BASELINES[name]
+    found = attribute(file, name.rpartition(":")[2], OWN)
+    if not isinstance(found, Baseline):
+        raise ValueError(f"{name} is {found!r}; it must be a jaxouter.evaluation.baselines.Baseline")
+    return found
+
+
+def _file(name: str) -> Path | None:
+    file, colon, _ = name.rpartition(":")
+    return Path(file) if colon and file.endswith(".py") else None

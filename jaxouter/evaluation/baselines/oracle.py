@@ -1,0 +1,152 @@
+"""`oracle`, the limit: the learner's own actor and observation, trained through the simulator on the return itself.
+
+The plants are differentiable, so the gradient of the return is computed by back-propagation through whole episodes of
+the training distribution (analytic policy gradient). What this policy reaches is what the observation and the network
+allow; what the learner lacks to it, it lacks by learning. It reads the plant's equations, which no outer loop can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.cache import Tuned, cached
+from jaxouter.identification import counterfactual, identify
+from jaxouter.identification.identify import LEVELS, static
+from jaxouter.loop.policy import AffineParams
+from jaxouter.plants import Plant, make
+from jaxouter.training.config import TrainConfig, preset, to_dict
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, folded, pretrain_on
+from jaxouter.training.trainer import build as build_trainer
+
+SEEDS = 3
+BATCH = 64  # episodes a gradient step and seed
+FIRST_STAGE = 1000  # gradient steps; each stage then doubles their number
+STAGES = 3
+MOST = FIRST_STAGE * 2 ** (STAGES - 1)  # gradient steps
+ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
+CHUNK = 50  # gradient steps between two reports
+DRAWN = 2048  # plants that are simulated beforehand
+VALIDATION = 512  # training episodes on which the best seed is chosen
+
+
+@partial(jax.jit, static_argnums=0)
+def returns(
+    rollout: DifferentiableRollout, actors: Any, base: AffineParams, plant_params: Any, key: chex.PRNGKey
+) -> jax.Array:
+    """Mean return of each actor (seeds, ...) on `VALIDATION` episodes of the training distribution; (seeds,)."""
+
+    def mean(actor: Any) -> jax.Array:
+        keys = jax.random.split(key, VALIDATION)
+        each = jax.vmap(lambda key: rollout.episode(rollout.policy, LearnedParams(actor, base), plant_params, key)[0])
+        return jnp.mean(each(keys)) * rollout.plant.episode_steps * rollout.plant.error_scale
+
+    return jax.lax.map(mean, actors)
+
+
+def differentiable(config: TrainConfig) -> tuple[DifferentiableRollout, Any]:
+    """The roll-out with actor and disturbances of a configuration, and the parameters of its plant."""
+    trainer, env = build_trainer(config)
+    return DifferentiableRollout.of(config.pretraining, trainer.env.plant, trainer.policy, BATCH), env.plant
+
+
+def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
+    """The limit of a configuration that draws plants: its own pretraining, but on these plants themselves.
+
+    Those that respond alike at all times are simulated beforehand. From the cache where it was made before.
+    """
+    start = config.pretraining
+
+    def make_it() -> Tuned:
+        trainer, params = build_trainer(config)
+        key_actor, key_static, key_drawn, *keys = jax.random.split(jax.random.key(0), 5)
+        plant, of_plant = trainer.env.plant, params.plant
+        learned = LearnedParams(
+            trainer.agent.actor(trainer.agent.init(key_actor)), static(*make(config.plant), key_static)[1]
+        )
+        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
+        try:
+            of_plant = counterfactual.simulated(longer, of_plant, key_drawn, DRAWN)
+            plant = counterfactual.plant(plant, longer.episode_steps)
+        except ValueError:
+            pass  # stepped itself
+
+        def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
+            report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
+
+        actor = pretrain_on(start, plant, of_plant, trainer.policy, learned, keys, heard)
+        steps = start.gradient_steps * start.batch_size * longer.episode_steps
+        return kept(actor, learned.base, {"gradient_steps": start.gradient_steps}, steps)
+
+    key = {"config": to_dict(replace(config, seed=0, seeds=1, devices=1))}
+    return cached(f"{config.plant}-oracle-{config.preset}", key, make_it)
+
+
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
+    del budget
+    history, _ = identify.suitable_history(plant, params, key)
+    found = train(differentiable(replace(preset(plant.name), history=history))[0], params, key, report)
+    return found._replace(settings=found.settings | {"history": history})
+
+
+def train(rollout: DifferentiableRollout, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
+    """Train three seeds in stages that double what there is, until one gains less than 1 %; the best seed."""
+    plant = rollout.plant
+    key_static, key_white, key_seeds, key_run, key_test = jax.random.split(key, 5)
+    _, base = static(plant, params, key_static)
+    white = rollout.whitening(base, params, key_white)
+    actors = jax.vmap(lambda key: rollout.policy.init_actor(jax.random.split(key)[0]))(
+        jax.random.split(key_seeds, SEEDS)
+    )
+    fold = jax.jit(jax.vmap(folded, (0, None)))
+    stages: list[np.ndarray] = []  # returns (seeds,) after each
+    best, gradient_steps = actors, 0
+    for stage in range(STAGES):
+        length = FIRST_STAGE * 2 ** max(0, stage - 1)  # 1000, 1000, 2000: each doubles what there is
+        rates = cosine(length)
+        carry = actors, jax.vmap(ADAM.init)(actors)
+        for i in range(0, length, CHUNK):
+            key_run, key_chunk = jax.random.split(key_run)
+            carry, _ = rollout.train(carry, white, base, params, rates[i : i + CHUNK], key_chunk)
+            jax.block_until_ready(carry)
+            done = gradient_steps + i + CHUNK
+            report(f"{done:,} of at most {MOST:,} gradient steps", done / MOST)
+        actors, gradient_steps = carry[0], gradient_steps + length
+        stages.append(np.asarray(returns(rollout, fold(actors, white), base, params, key_test)))
+        so_far = [values.max() for values in stages]
+        if so_far[-1] == max(so_far):
+            best = jax.tree.map(lambda leaf: leaf[stages[-1].argmax()], fold(actors, white))
+        if stage and so_far[-1] - max(so_far[:-1]) < ENOUGH * abs(so_far[-1]):
+            break
+    settings = {"gradient_steps": gradient_steps, "returns": [values.round(3).tolist() for values in stages]}
+    return kept(best, base, settings, (SEEDS * gradient_steps * BATCH + LEVELS) * plant.episode_steps)
+
+
+def kept(actor: Any, base: AffineParams, settings: dict[str, Any], steps: int) -> Tuned:
+    """What was found, as it is kept."""
+    arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(actor).items()}
+    return Tuned({"slope": float(base.slope), "offset": float(base.offset)} | settings, arrays, steps)
+
+
+def learned(tuned: Tuned) -> LearnedParams:
+    """The policy's parameters from what was found."""
+    actor = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
+    base = AffineParams(*(jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset")))
+    return LearnedParams(actor, base)
+
+
+def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
+    """The policy from what `tune` found."""
+    config = replace(preset(plant.name), history=tuned.settings["history"])
+    return build_trainer(config)[0].policy, learned(tuned)

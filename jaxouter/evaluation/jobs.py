@@ -1,0 +1,417 @@
+"""The comparison: every policy on every scenario, every sweep and every stability analysis, spread over the cores.
+
+Work is cut into jobs, plain picklable values, that `run` executes in this or another process. What depends on nothing
+but code and configuration, all that concerns the built-in baselines, is kept in the cache.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from multiprocessing import resource_tracker
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxouter.evaluation import cache, scenarios, stability, sweeps
+from jaxouter.evaluation.baselines import CLAIRVOYANT, NAMES, OWN, Baseline, Kind, identified, resolve
+from jaxouter.evaluation.baselines.clairvoyant import Replay, plan
+from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.loop.policy import Policy
+from jaxouter.plants import Plant, make
+from jaxouter.plants.errors import PlantError
+from jaxouter.plants.registry import attribute, own_errors
+from jaxouter.training.run import Run
+
+TUNED = ("baseline", "limit")  # kinds of policies that are identified first
+WITHIN = 1e-3  # share of the steps that may lie outside the limits
+SET_POINTS = 5  # of the stability analysis, over the range of evaluation
+LEARNED_NOTE = "The learned outer loop, without exploration."
+TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
+Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
+IDENTIFY = {"oracle": 90.0, "inverse": 30.0, "mpc": 60.0, "deepc": 90.0, "pi": 15.0}  # about seconds that it takes
+NEEDS = {"oracle": "differentiable", CLAIRVOYANT: "affine"}  # what the plant must be declared
+PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
+
+
+class Entrant(NamedTuple):
+    """A policy of the comparison and where it comes from."""
+
+    name: str
+    kind: Kind
+    path: str | None = None  # run folder, or the user's file
+    seed: int | None = None  # of a run
+    attribute: str = ""  # class in the user's file
+
+    @property
+    def line(self) -> tuple[str, str | None]:
+        """Policy and run, the same for all seeds."""
+        return self.name, self.path if self.kind == "learned" else None
+
+
+class Job(NamedTuple):
+    """One piece of work; `what` is identify, meet, sweep or certify."""
+
+    what: str
+    entrant: Entrant
+    plant: str
+    on: str = ""  # scenario or sweep
+    family_seed: int = scenarios.FAMILY_SEED
+
+    @property
+    def work(self) -> float:
+        """What it takes, in about seconds."""
+        if self.what == "identify":
+            return IDENTIFY.get(self.entrant.name, 1.0)
+        return {"evaluate": 1.0, "sweep": 5.0, "stability": 3.0}[self.what]
+
+    def __str__(self) -> str:
+        seed = "" if self.entrant.seed is None else f" seed {self.entrant.seed}"
+        return f"{self.what} {self.entrant.name}{seed} {self.on}".strip()
+
+
+class Done(NamedTuple):
+    """A job, what it gave, and how long it took."""
+
+    job: Job
+    found: Tuned
+    seconds: float
+
+
+def entrant(name: str, plant: Plant) -> Entrant:
+    """The policy that a command line names: a built-in one, or FILE.py:CLASS.
+
+    Raises:
+        ValueError: there is no such policy or file, or the plant does not allow it.
+    """
+    file, colon, attribute_name = name.rpartition(":")
+    if colon and file.endswith(".py"):
+        if isinstance(attribute(Path(file), attribute_name, OWN), Baseline):
+            return Entrant(name, resolve(name).kind)
+        return Entrant(f"{Path(file).name}:{attribute_name}", "user", file, None, attribute_name)
+    if name not in NAMES:
+        raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
+    if name not in possible(plant):
+        raise ValueError(f"there is no {name} for {plant.name}, which is not declared {NEEDS[name]}")
+    return Entrant(name, "preview" if name == CLAIRVOYANT else resolve(name).kind)
+
+
+def is_own(name: str | None) -> bool:
+    """Whether a command line names what a file of the user's holds."""
+    return name is not None and ".py:" in name
+
+
+def possible(plant: Plant) -> list[str]:
+    """The built-in policies that the plant allows."""
+    return [name for name in NAMES if name not in NEEDS or getattr(plant, NEEDS[name])]
+
+
+@contextmanager
+def blamed(name: str, what: str, own: bool = True) -> Iterator[None]:
+    """Turns whatever a user's own policy raises in here into a ValueError that names it."""
+    try:
+        yield
+    except PlantError:
+        raise
+    except Exception as error:
+        if not own:
+            raise
+        raise ValueError(f"{name} {what}: {type(error).__name__}: {error}") from error
+
+
+@lru_cache(maxsize=64)
+def load(entrant: Entrant, plant_name: str) -> tuple[Policy, Any]:
+    """The policy and its parameters.
+
+    Raises:
+        ValueError: a run has no checkpoint, or a user's policy can't be made.
+    """
+    plant, _ = make(plant_name)
+    if entrant.kind == "learned":
+        return Run.open(Path(entrant.path or "")).policy(entrant.seed or 0)
+    if entrant.kind == "user":
+        with blamed(entrant.name, "can't be made"):
+            policy = attribute(Path(entrant.path or ""), entrant.attribute, OWN)(plant)
+        return policy, getattr(policy, "params", ())
+    return resolve(entrant.name).build(plant, identified(entrant.name, plant_name))
+
+
+def evaluate(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """Figures of merit on a scenario, the traces of its first episode, and the MAE of each (episodes,)."""
+    scenario = scenarios.get(on, family_seed=family_seed)
+    if entrant.kind == "preview":
+        best = plan(scenario)
+        traces = rollout(Replay(), best.r_tilde, scenario, per_episode=True)
+    else:
+        traces = rollout(*load(entrant, plant_name), scenario)
+    arrays = {name: getattr(traces, name)[:1] for name in TRACES}
+    arrays["mae"] = np.mean(np.abs(traces.r - traces.y), axis=1)
+    return Tuned(figures_of_merit(traces, scenario) | {"stable_alone": scenario.stable_alone}, arrays, 0)
+
+
+def sweep(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """MAE over the grid of a sweep, a coarser one for policies that run on the host."""
+    del family_seed
+    policy, params = load(entrant, plant_name)
+    swept = sweeps.get(on, coarse=policy.host)
+    found = swept.mae(rollout(policy, params, swept.scenario))
+    mae = np.where(np.isfinite(found), found.astype(object), np.array(None)).tolist()
+    return Tuned({"values": [list(axis.values) for axis in swept.axes], "mae": mae}, {}, 0)
+
+
+def analyse(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
+    """Local stability at set-points over the range of evaluation, on the plant of a scenario."""
+    scenario = scenarios.get(on, 1, family_seed)
+    params = jax.tree.map(lambda leaf: leaf[0], scenario.params)
+    points = np.linspace(*scenario.plant.evaluation_range, SET_POINTS)
+    rows = stability.analyse(*load(entrant, plant_name), scenario.plant, params, points.tolist())
+    return Tuned({"rows": [row._asdict() for row in rows]}, {}, 0)
+
+
+def run(job: Job, report: Report = lambda text, share: None) -> Done:
+    """Do one job.
+
+    Raises:
+        ValueError: it can't be done, or a user's policy or plant failed at it.
+    """
+    with own_errors():
+        return _run(job, report)
+
+
+def _run(job: Job, report: Report) -> Done:
+    begin, c = time.perf_counter(), job.entrant
+    report("", 0.0)
+    if job.what == "identify":
+        return Done(job, identified(c.name, job.plant, report), time.perf_counter() - begin)
+    work = {"evaluate": evaluate, "sweep": sweep, "stability": analyse}[job.what]
+    if c.kind == "learned":
+        found = work(c, job.plant, job.on, job.family_seed)
+    elif is_own(c.name):
+        with blamed(c.name, f"failed on {job.on}"), own_errors():
+            found = work(c, job.plant, job.on, job.family_seed)
+    else:
+        key = {"on": job.on, "family_seed": job.family_seed}
+        make_it = partial(work, c, job.plant, job.on, job.family_seed)
+        found = cache.cached(f"{job.plant}-{c.name}-{job.what}", key, make_it)
+    return Done(job, found, time.perf_counter() - begin)
+
+
+def jobs(
+    plant: str, entrants: Sequence[Entrant], selected: Sequence[str], swept: Sequence[str], family_seed: int
+) -> list[Job]:
+    """All jobs: identification first, of it the long ones."""
+    work = [Job("identify", c, plant) for c in reversed(entrants) if c.kind in TUNED]
+    acting = [c for c in entrants if c.kind != "preview"]
+    first_seeds = {c.line: c for c in reversed(acting)}  # of each run, for sweeps and stabilities
+    one_seed = [c for c in acting if first_seeds[c.line] == c]
+    work += [Job("evaluate", c, plant, on, family_seed) for on in selected for c in entrants]
+    work += [Job("sweep", c, plant, on) for on in swept for c in one_seed]
+    work += [
+        Job("stability", c, plant, on, family_seed)
+        for on in scenarios.for_stability(plant)
+        if on in selected and make(plant)[0].differentiable
+        for c in one_seed
+    ]
+    return work
+
+
+class _Worker:
+    """What a process of the pool knows: where to say how far it is."""
+
+    messages: Any = None
+
+    @classmethod
+    def begin(cls, messages: Any, initialise: Callable[[], None]) -> None:
+        cls.messages = messages
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone
+        threading.Thread(target=cls.end_with_parent, daemon=True).start()
+        initialise()
+
+    @staticmethod
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)  # however the command ended, its workers don't outlive it
+
+    @classmethod
+    def run(cls, job: Job) -> Done:
+        return run(job, lambda text, share: cls.messages.put((job, text, share)))
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Processes that start in here are deaf to Ctrl-C from the first, and don't run the script of this one again.
+
+    That script, or notebook, holds nothing that they need, and they need not be guarded against. Where signals can be
+    blocked, a Ctrl-C that comes meanwhile is heard afterwards.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    in_main_thread = threading.current_thread() is threading.main_thread()  # the one that may set a handler
+    can_block = in_main_thread and hasattr(signal, "pthread_sigmask")
+    handler = before = None
+    if can_block:
+        resource_tracker.ensure_running()  # whose start would unblock it
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    elif in_main_thread:
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        if can_block:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before or set())
+        elif in_main_thread:
+            signal.signal(signal.SIGINT, handler)
+
+
+def spread(
+    work: Sequence[Job], initialise: Callable[[], None], report: Callable[[Job, str, float], None]
+) -> Iterator[Done]:
+    """The jobs as they get done: on a CPU in a process a core, on an accelerator one after the other.
+
+    Args:
+        work: jobs; those of a policy begin when its identification, where that is among them, is done.
+        initialise: called first in each process; picklable.
+        report: told now and then how far each is: what was done, and which share of it that is.
+    """
+    cores = os.cpu_count() or 1
+    alone = cores == 1 or len(work) == 1 or multiprocessing.current_process().daemon  # which may have no children
+    if jax.default_backend() != "cpu" or alone:
+        for job in work:
+            yield run(job, partial(report, job))
+        return
+    context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
+    messages = context.SimpleQueue()
+    with ProcessPoolExecutor(min(cores, len(work)), context, _Worker.begin, (messages, initialise)) as pool:
+        identifying = {job.entrant for job in work if job.what == "identify"}
+        free = [job for job in work if job.what == "identify" or job.entrant not in identifying]
+        try:
+            with _starting():
+                waiting = {pool.submit(_Worker.run, job) for job in free}
+            while waiting:
+                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+                while not messages.empty():
+                    report(*messages.get())
+                for future in done:
+                    finished = future.result()
+                    if finished.job.what == "identify":
+                        freed = (job for job in work if job.entrant == finished.job.entrant and job != finished.job)
+                        with _starting():
+                            waiting |= {pool.submit(_Worker.run, job) for job in freed}
+                    yield finished
+        except BrokenProcessPool:
+            raise ValueError(
+                "a process of the comparison ended at once: memory ran out, or a library crashed"
+            ) from None
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, dict[str, Any]]:
+    """What each policy is, and what its identification and tuning took."""
+    tuned = {d.job.entrant.name: d for d in done if d.job.what == "identify"}
+    found: dict[str, dict[str, Any]] = {}
+    for c in entrants:
+        known = {"kind": c.kind, "steps": None, "seconds": None, "settings": {}, "note": ""}
+        if c.kind == "learned":
+            paths = dict.fromkeys(other.path or "" for other in entrants if other.kind == "learned")
+            configs = {Path(path).name: Run.open(Path(path)).config for path in paths}
+            known |= {"steps": max(config.environment_steps for config in configs.values()), "note": LEARNED_NOTE}
+            known |= {"settings": {name: config.preset for name, config in configs.items()}}
+        elif c.kind == "preview":
+            known |= {"note": PREVIEW_NOTE}
+        elif c.kind == "user":
+            known |= {"note": f"{c.attribute} of {c.path}"}
+        else:
+            identification = tuned[c.name]
+            known |= {"steps": identification.found.steps, "seconds": identification.found.seconds}
+            known |= {"settings": identification.found.settings, "note": resolve(c.name).note}
+        found[c.name] = known
+    return found
+
+
+def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
+    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone.
+
+    `worse_than_static` is the share of the episodes in which its MAE is above that of `static`.
+    """
+    selected = [d for d in done if d.job.what == "evaluate"]
+    static = {d.job.on: d.found.arrays["mae"] for d in selected if d.job.entrant.name == "static"}
+    reference = {(d.job.entrant.name, d.job.on): d.found.settings["mae"] for d in selected}
+
+    def over(mae: float | None, name: str, on: str) -> float | None:
+        against = reference.get((name, on))
+        return None if mae is None or not against else mae / against
+
+    found = []
+    for d in selected:
+        figures, c, on = dict(d.found.settings), d.job.entrant, d.job.on
+        stable, outside = figures.pop("stable_alone"), figures["violation_time"]
+        mae, alone = figures["mae"], over(figures["mae"], "none", on)
+        figures["improvement"] = 100.0 * (1.0 - alone) if alone is not None and stable else None
+        worse = float(np.mean(~(d.found.arrays["mae"] <= static[on]))) if on in static else None
+        found.append(
+            {
+                "policy": c.name,
+                "run": c.line[1],
+                "seed": c.seed,
+                "scenario": on,
+                "mae": mae,
+            }
+            | {"ratio_to_limit": over(mae, "oracle", on), "ratio_to_bound": over(mae, CLAIRVOYANT, on)}
+            | {"within_limits": mae is not None and (outside is None or outside <= WITHIN)}
+            | {"worse_than_static": worse}
+            | figures
+        )
+    return found
+
+
+def first_episodes(done: Sequence[Done], on: str) -> dict[Entrant, Traces]:
+    """Traces of the first episode of a scenario under each policy; of a run its first seed."""
+    nothing = dict(reward=None, each_outside=None, each_excess=None, members=None)
+    found: dict[Any, tuple[Entrant, Traces]] = {}
+    for d in done:
+        if d.job.what == "evaluate" and d.job.on == on:
+            c = d.job.entrant
+            found.setdefault(c.line, (c, Traces(**{name: d.found.arrays[name] for name in TRACES}, **nothing)))
+    return dict(found.values())
+
+
+def swept(done: Sequence[Done], names: Sequence[str], label: Labels) -> dict[str, Any]:
+    """The sweeps as JSON values."""
+    found: dict[str, Any] = {}
+    for name in names:
+        axes = [axis.__dict__ | {"values": list(axis.values)} for axis in sweeps.get(name).axes]
+        own = [d for d in done if d.job.what == "sweep" and d.job.on == name]
+        found[name] = {"axes": axes, "policies": {label[d.job.entrant.line]: d.found.settings for d in own}}
+    return found
+
+
+def stabilities(done: Sequence[Done], label: Labels) -> list[Mapping[str, Any]]:
+    """The stabilities as JSON values."""
+    certified = [d for d in done if d.job.what == "stability"]
+    return [
+        {"policy": label[d.job.entrant.line], "scenario": d.job.on, **row}
+        for d in certified
+        for row in d.found.settings["rows"]
+    ]

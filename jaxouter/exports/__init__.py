@@ -1,0 +1,1 @@
+"""The learned controller as a file for other tools."""

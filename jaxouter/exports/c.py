@@ -1,0 +1,105 @@
+"""The controller as C99: NAME.c with the weights, NAME.h beside it. It allocates no memory and has no global state."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from jaxouter.exports.spec import ControllerSpec
+
+COMPILERS = ("cc", "gcc", "clang")
+FLAGS = ("-std=c99", "-O2", "-shared", "-fPIC")
+
+
+def prefix(spec: ControllerSpec) -> str:
+    """What every symbol begins with: an identifier of C from the name of the plant."""
+    name = re.sub(r"\W+", "_", spec.plant, flags=re.ASCII).strip("_")
+    return f"{'plant_' if name[:1].isdigit() else ''}{name}_outer_loop".lstrip("_")
+
+
+def header_and_source(spec: ControllerSpec, stem: str) -> tuple[str, str]:
+    """Text of the .h and of the .c file that are called `stem`."""
+    widths = [3 + 2 * spec.history, *(len(bias) for bias in spec.biases)]
+    values = dict(spec=spec, name=prefix(spec), stem=stem, widths=widths)
+    return render("controller.h.j2", **values), render("controller.c.j2", **values)
+
+
+def save(spec: ControllerSpec, path: Path) -> None:
+    """Write the .c file, and the .h file beside it."""
+    header, source = header_and_source(spec, path.stem)
+    path.write_text(source, encoding="utf-8")
+    path.with_suffix(".h").write_text(header, encoding="utf-8")
+
+
+def compiler() -> str:
+    """The system's C compiler.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    found = next(filter(None, map(shutil.which, COMPILERS)), None)
+    if found is None:
+        raise FileNotFoundError(
+            f"there is no C compiler on the PATH; install one that is called {' or '.join(COMPILERS)}"
+        )
+    return found
+
+
+def shared_library(sources: Sequence[Path], out: Path, *flags: str) -> None:
+    """Compile the sources into a shared library.
+
+    Raises:
+        FileNotFoundError: there is no compiler.
+        RuntimeError: it fails; with what it says.
+    """
+    command = [compiler(), *FLAGS, *flags, *map(str, sources), "-o", str(out), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
+
+
+def render(template: str, **values: Any) -> str:
+    """A template of this folder with its values; XML is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxouter.exports", "."),
+        autoescape=lambda name: name is not None and name.endswith(".xml.j2"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"comment": _comment, "float": _float, "macro": _macro}
+    environment.filters |= {"floats": _floats, "interval": _interval}
+    return environment.get_template(template).render(**values)
+
+
+def _comment(text: str) -> str:
+    """A text that ends no comment, and begins none."""
+    return re.sub(r"[\x00-\x1f\\]", " ", text).replace("*/", "* /").replace("/*", "/ *")
+
+
+def _float(value: float) -> str:
+    """A constant of C that is the same float32."""
+    return f"{np.float32(value)!s}f"
+
+
+def _macro(value: float) -> str:
+    """The same, as it may stand in a macro."""
+    return f"({_float(value)})" if value < 0 else _float(value)
+
+
+def _floats(array: np.ndarray) -> str:
+    """The elements of an initialiser, row after row."""
+    return textwrap.fill(", ".join(map(_float, array.ravel())), 120, initial_indent="    ", subsequent_indent="    ")
+
+
+def _interval(bounds: tuple[float, float]) -> str:
+    return f"[{bounds[0]:g}, {bounds[1]:g}]"

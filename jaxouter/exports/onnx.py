@@ -1,0 +1,142 @@
+"""The controller as an ONNX graph; needs the extra `onnx`.
+
+    inputs   r (), y (), y_past (H,), r_tilde_past (H,), integral ()
+    outputs  r_tilde (), y_past_next (H,), r_tilde_past_next (H,), integral_next ()
+
+All are float32. The graph has no memory: what comes out as `..._next` goes in at the next control step. How to begin,
+units and bounds stand in the metadata of the model.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxouter.exports.spec import ControllerSpec
+
+try:
+    import onnx
+    from onnx import helper, numpy_helper
+except ImportError as error:
+    raise ImportError('jaxouter.exports.onnx needs ONNX: pip install "jaxouter[onnx]"') from error
+
+OPSET, IR_VERSION = 17, 8  # of 2022, which runtimes of controllers read too
+START = (
+    "Before the first step: y_past is filled with the first y, r_tilde_past with that y clipped to "
+    "[r_tilde_min, r_tilde_max], integral is 0."
+)
+
+
+class _Graph:
+    """Nodes and constants as they are added."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def constant(self, name: str, value: Any, dtype: Any = np.float32) -> str:
+        self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def add(self, kind: str, output: str, *inputs: str, **attributes: Any) -> str:
+        self.nodes.append(helper.make_node(kind, list(inputs), [output], name=output, **attributes))
+        return output
+
+
+def model(spec: ControllerSpec) -> onnx.ModelProto:
+    """The graph of `ControllerSpec.act`, checked."""
+    graph = _Graph()
+    observation = _observation(graph, spec)
+    action = _network(graph, spec, observation)
+    low, high = spec.r_tilde_bounds
+    scaled = graph.add("Mul", "action_scaled", action, graph.constant("r_tilde_half", (high - low) / 2))
+    slope, offset = graph.constant("slope", spec.slope), graph.constant("offset", spec.offset)
+    base = graph.add("Add", "base", graph.add("Mul", "slope_r", slope, "r"), offset)
+    unclipped = graph.add("Add", "r_tilde_unclipped", base, scaled)
+    bounds = graph.constant("r_tilde_min", low), graph.constant("r_tilde_max", high)
+    graph.add("Clip", "r_tilde", unclipped, *bounds)
+    _remember(graph)
+    past, y = [spec.history], spec.y_unit
+    made = helper.make_graph(
+        graph.nodes,
+        f"{spec.plant} outer loop",
+        [
+            _value("r", [], f"reference, {y}"),
+            _value("y", [], f"measured output, {y}"),
+            _value("y_past", past, f"y of the steps before, newest first, {y}"),
+            _value("r_tilde_past", past, f"r~ of the steps before, newest first, {y}"),
+            _value("integral", [], f"leaky integral of r - y, {y}"),
+        ],
+        [
+            _value("r_tilde", [], f"modified reference for the closed loop, {y}"),
+            _value("y_past_next", past, "y_past of the next step"),
+            _value("r_tilde_past_next", past, "r_tilde_past of the next step"),
+            _value("integral_next", [], "integral of the next step"),
+        ],
+        graph.constants,
+    )
+    opset = helper.make_opsetid("", OPSET)
+    out = helper.make_model(made, opset_imports=[opset], ir_version=IR_VERSION, producer_name="jaxouter")
+    out.doc_string = (
+        f"Outer loop around {spec.plant}; run it once every {spec.control_step:g} {spec.time_unit}. {START}"
+    )
+    helper.set_model_props(out, metadata(spec))
+    onnx.checker.check_model(out, full_check=True)
+    return out
+
+
+def metadata(spec: ControllerSpec) -> dict[str, str]:
+    """What a caller has to know, as the texts that ONNX keeps."""
+    (low, high), (r_min, r_max), (y_min, y_max) = spec.r_tilde_bounds, spec.setpoint_range, spec.y_range
+    numbers = {"control_step": spec.control_step, "r_tilde_min": low, "r_tilde_max": high}
+    numbers |= {"r_min": r_min, "r_max": r_max, "y_min": y_min, "y_max": y_max, "history": spec.history}
+    texts = {"plant": spec.plant, "y_unit": spec.y_unit, "time_unit": spec.time_unit, "start": START}
+    return texts | {name: repr(value) for name, value in numbers.items()}
+
+
+def save(spec: ControllerSpec, path: Path) -> None:
+    """Write the model."""
+    onnx.save(model(spec), path)
+
+
+def _value(name: str, shape: list[int], text: str) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape, text)
+
+
+def _observation(graph: _Graph, spec: ControllerSpec) -> str:
+    """Of `jaxouter.loop.observation.Observer`, (3 + 2H,); it leaves `error` and `integral_next` too."""
+    low, high = spec.r_tilde_bounds
+    error = graph.add("Sub", "error", "r", "y")
+    change = graph.add("Sub", "error_minus_integral", error, "integral")
+    leak = graph.add("Div", "integral_change", change, graph.constant("integral_steps", spec.integral_steps))
+    integral = graph.add("Add", "integral_next", "integral", leak)
+    above = graph.add("Sub", "r_above_middle", "r", graph.constant("y_middle", spec.y_middle))
+    axis = graph.constant("first_axis", [0], np.int64)
+    present = [graph.add("Unsqueeze", f"{name}_1", name, axis) for name in (above, error, integral)]
+    past = graph.add("Sub", "y_past_minus_y", "y_past", "y")
+    of_y = graph.add("Concat", "of_y", *present, past, axis=0)
+    of_y = graph.add("Div", "of_y_scaled", of_y, graph.constant("y_scale", spec.y_scale))
+    around = graph.add("Sub", "of_r_tilde", "r_tilde_past", graph.constant("r_tilde_middle", (low + high) / 2))
+    of_r_tilde = graph.add("Div", "of_r_tilde_scaled", around, graph.constant("r_tilde_scale", (high - low) / 2))
+    return graph.add("Concat", "observation", of_y, of_r_tilde, axis=0)
+
+
+def _network(graph: _Graph, spec: ControllerSpec, x: str) -> str:
+    """The action, a scalar in [-1, 1]."""
+    for i, (weight, bias) in enumerate(zip(spec.weights, spec.biases, strict=True)):
+        x = graph.add("MatMul", f"product_{i}", x, graph.constant(f"weight_{i}", weight))
+        x = graph.add("Add", f"layer_{i}", x, graph.constant(f"bias_{i}", bias))
+        x = graph.add("Tanh", "tanh", x) if i == len(spec.weights) - 1 else graph.add("Relu", f"relu_{i}", x)
+    return graph.add("Squeeze", "action", x, "first_axis")
+
+
+def _remember(graph: _Graph) -> None:
+    """The newest sample in front, the oldest one out."""
+    begin, end = graph.constant("begin", [0], np.int64), graph.constant("all_but_last", [-1], np.int64)
+    for name, newest in (("y_past", "y"), ("r_tilde_past", "r_tilde")):
+        kept = graph.add("Slice", f"{name}_kept", name, begin, end)
+        graph.add(
+            "Concat", f"{name}_next", graph.add("Unsqueeze", f"{name}_newest", newest, "first_axis"), kept, axis=0
+        )

@@ -1,0 +1,272 @@
+"""Whether an exported controller does what the policy does: runs the file that was written, beside the policy."""
+
+from __future__ import annotations
+
+import ctypes
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+
+from jaxouter.exports import c
+from jaxouter.exports.spec import ControllerSpec, State
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+
+STEPS = 1_000
+AT_A_STEP = 1e-5  # what may lie between both, in terms of the range of r~, when both are in the policy's state
+IN_CLOSED_LOOP = 1e-4  # when each is in a state of its own
+HELD = 20  # control steps for which a set-point is held
+
+
+class Controller(Protocol):
+    """A file that was opened. It takes states of its own and those of `ControllerSpec`."""
+
+    def init(self, y0: float) -> Any:
+        """State before the first step."""
+        ...
+
+    def act(self, state: Any, r: float, y: float) -> tuple[Any, Any]:
+        """One control step: the next state and r~."""
+        ...
+
+
+class Signals(NamedTuple):
+    """What the policy saw and did; the leading axis is that of T steps."""
+
+    r: np.ndarray
+    y: np.ndarray
+    state: State  # before the step
+    r_tilde: np.ndarray
+
+
+class Deviation(NamedTuple):
+    """The largest one over all steps, in terms of the range of r~."""
+
+    at_a_step: float
+    in_closed_loop: float
+
+    @property
+    def small(self) -> bool:
+        """Whether it is within both tolerances; what is not a number is not."""
+        return self.at_a_step <= AT_A_STEP and self.in_closed_loop <= IN_CLOSED_LOOP
+
+
+def verify(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> Deviation:
+    """How far the r~ of an exported file are from the policy's.
+
+    Raises:
+        ImportError: what runs this kind of file is not installed.
+        FileNotFoundError: there is no C compiler, which C needs to run.
+    """
+    with opened(kind, path, spec) as controller:
+        return deviation(controller, spec, signals(spec, policy, params))
+
+
+def signals(spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams, steps: int = STEPS) -> Signals:
+    """The policy on random set-points, and a y that follows them with a lag and noise."""
+    rng = np.random.default_rng(0)
+    low, high = spec.setpoint_range
+    r = np.repeat(rng.uniform(low, high, -(-steps // HELD)), HELD)[:steps]
+    y, now = np.empty(steps), rng.uniform(low, high)
+    for k, noise in enumerate(rng.normal(0.0, (high - low) / 5, steps)):
+        y[k] = now = np.clip(now + 0.2 * (r[k] + noise - now), *spec.y_range)
+    r, y = r.astype(np.float32), y.astype(np.float32)
+    with jax.default_matmul_precision("highest"):
+        memory, r_tilde = jax.device_get(_record(policy, params, jnp.asarray(r, float), jnp.asarray(y, float)))
+    return Signals(r, y, State(*jax.tree.map(np.float32, tuple(memory))), r_tilde)
+
+
+@partial(jax.jit, static_argnums=0)
+def _record(policy: LearnedPolicy, params: LearnedParams, r: jax.Array, y: jax.Array) -> tuple[Any, jax.Array]:
+    def step(memory: Any, seen: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
+        after, r_tilde = policy.act(params, memory, *seen)
+        return after, (memory, r_tilde)
+
+    return jax.lax.scan(step, policy.init(params, r[0], y[0]), (r, y))[1]
+
+
+def deviation(controller: Controller, spec: ControllerSpec, seen: Signals) -> Deviation:
+    """Of a controller from what the policy did, step by step in its state, and in a state of the controller's own."""
+    state, got = controller.init(seen.y[0]), []
+    for k, (r, y) in enumerate(zip(seen.r, seen.y, strict=True)):
+        _, at_a_step = controller.act(jax.tree.map(lambda leaf, k=k: leaf[k], seen.state), r, y)
+        state, in_closed_loop = controller.act(state, r, y)
+        got.append((float(at_a_step), float(in_closed_loop)))
+    low, high = spec.r_tilde_bounds
+    away = np.abs(np.asarray(got) - np.asarray(seen.r_tilde, float)[:, None]).max(0) / (high - low)
+    return Deviation(*map(float, away))
+
+
+@contextmanager
+def opened(kind: str, path: Path, spec: ControllerSpec) -> Iterator[Controller]:
+    """The controller in a file of this kind.
+
+    Raises:
+        ImportError: what runs it is not installed.
+        FileNotFoundError: there is no C compiler, which C needs to run.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        match kind:
+            case "npz":
+                yield ControllerSpec.load(path)
+            case "onnx":
+                yield OnnxController(path, spec)
+            case "stablehlo":
+                yield StablehloController(path, spec)
+            case "c":
+                library = Path(place) / "controller.so"
+                c.shared_library([path], library)
+                yield CController(library, spec)
+            case "fmu":
+                with FmuController(path, Path(place) / "fmu", spec) as controller:
+                    yield controller
+            case _:
+                raise ValueError(f"there is no format {kind!r}")
+
+
+class OnnxController:
+    """Run by ONNX Runtime."""
+
+    def __init__(self, path: Path, spec: ControllerSpec) -> None:
+        try:
+            import onnxruntime
+        except ImportError:
+            raise ImportError("what runs it is not installed: pip install onnxruntime") from None
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self.init = spec.init  # as the metadata says
+        self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+    def act(self, state: State, r: float, y: float) -> tuple[State, float]:
+        """One control step."""
+        inputs = state._asdict() | {"r": r, "y": y}
+        outputs: Any = self._session.run(None, {name: np.asarray(x, np.float32) for name, x in inputs.items()})
+        return State(*outputs[1:]), outputs[0]
+
+
+class StablehloController:
+    """Run by JAX."""
+
+    def __init__(self, path: Path, spec: ControllerSpec) -> None:
+        self.init = spec.init  # as the module says
+        self._act = jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
+
+    def act(self, state: State, r: float, y: float) -> tuple[State, float]:
+        """One control step."""
+        r_tilde, *after = jax.device_get(self._act(np.float32(r), np.float32(y), *state))
+        return State(*after), r_tilde
+
+
+def _struct(spec: ControllerSpec) -> type[ctypes.Structure]:
+    """The state of the C code."""
+    past = ctypes.c_float * spec.history
+
+    class Struct(ctypes.Structure):
+        _fields_ = [("y_past", past), ("r_tilde_past", past), ("integral", ctypes.c_float)]
+
+    return Struct
+
+
+def _fill(struct: Any, state: State) -> None:
+    struct.y_past[:], struct.r_tilde_past[:] = state.y_past.tolist(), state.r_tilde_past.tolist()
+    struct.integral = state.integral.item()
+
+
+class CController:
+    """A library of the C code, called as C calls it."""
+
+    def __init__(self, library: Path, spec: ControllerSpec) -> None:
+        loaded, name = ctypes.CDLL(str(library)), c.prefix(spec)
+        self._struct = _struct(spec)
+        pointer = ctypes.POINTER(self._struct)
+        self._init, self._step = getattr(loaded, f"{name}_init"), getattr(loaded, f"{name}_step")
+        self._init.argtypes, self._init.restype = [pointer, ctypes.c_float], None
+        self._step.argtypes, self._step.restype = [pointer, ctypes.c_float, ctypes.c_float], ctypes.c_float
+
+    def init(self, y0: float) -> Any:
+        """State before the first step."""
+        struct = self._struct()
+        self._init(struct, y0)
+        return struct
+
+    def act(self, state: Any, r: float, y: float) -> tuple[Any, float]:
+        """One control step; the state that is given stays as it is."""
+        struct = self._struct()
+        if isinstance(state, State):
+            _fill(struct, state)
+        else:
+            ctypes.pointer(struct)[0] = state
+        return struct, self._step(struct, r, y)
+
+
+class FmuController:
+    """An FMU run by FMPy, as an importer steps it; states travel as serialised states of the FMU."""
+
+    def __init__(self, path: Path, place: Path, spec: ControllerSpec) -> None:
+        try:
+            import fmpy
+            from fmpy.fmi2 import FMU2Slave
+        except ImportError:
+            raise ImportError('what runs it is not installed: pip install "jaxouter[fmu]"') from None
+
+        description: Any = fmpy.read_model_description(str(path))
+        self._references = {v.name: v.valueReference for v in description.modelVariables}
+        self._step = float(description.defaultExperiment.stepSize)
+        self._fmu = FMU2Slave(
+            guid=description.guid,
+            modelIdentifier=description.coSimulation.modelIdentifier,
+            unzipDirectory=fmpy.extract(str(path), str(place)),
+            instanceName="outer_loop",
+        )
+        struct, values = _struct(spec), ctypes.c_double * len(self._references)
+
+        class Kept(ctypes.Structure):
+            _fields_ = [("controller", struct), ("value", values), ("begun", ctypes.c_int), ("phase", ctypes.c_int)]
+
+        self._kept = Kept
+
+    def __enter__(self) -> FmuController:
+        self._fmu.instantiate()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._fmu.terminate()
+        self._fmu.freeInstance()
+
+    def init(self, y0: float) -> bytes:
+        """State before the first step, which takes y0 from its y."""
+        del y0
+        self._fmu.reset()
+        self._fmu.setupExperiment()
+        self._fmu.enterInitializationMode()
+        self._fmu.exitInitializationMode()
+        return self._state()
+
+    def act(self, state: State | bytes, r: float, y: float) -> tuple[bytes, float]:
+        """One control step."""
+        if isinstance(state, State):
+            kept = self._kept.from_buffer_copy(self._state())
+            _fill(kept.controller, state)
+            kept.begun = 1
+            state = bytes(kept)
+        loaded = self._fmu.deSerializeFMUstate(state)
+        self._fmu.setFMUstate(loaded)
+        self._fmu.freeFMUstate(loaded)
+        self._fmu.setReal([self._references["r"], self._references["y"]], [r, y])
+        time = self._fmu.getReal([self._references["time"]])[0]
+        self._fmu.doStep(time, self._step)
+        return self._state(), self._fmu.getReal([self._references["r_tilde"]])[0]
+
+    def _state(self) -> bytes:
+        kept = self._fmu.getFMUstate()
+        out = self._fmu.serializeFMUstate(kept)
+        self._fmu.freeFMUstate(kept)
+        return out

@@ -1,0 +1,142 @@
+"""A plant as its own records tell it: what a recorded episode would have been under another r~.
+
+Of a linear plant the answer needs only its response to a change of r~: the recorded y, plus the response to the
+difference between the other r~ and the recorded one. Start, load and noise of the episode, known to nobody, are in the
+recorded y. So a record of (r~, y) and a fitted response make a plant that can be asked any number of times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.signal import lfilter, savgol_filter
+
+from jaxouter.identification.identify import Record
+from jaxouter.plants import Plant, simulate
+from jaxouter.plants.base import float_leaves, with_float_leaves
+
+
+class CounterfactualParams(NamedTuple):
+    """Recorded episodes (E, ...), and the response of each; an episode that is drawn, without E."""
+
+    a: jax.Array  # (E, n), dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i), with the differences to what was recorded
+    b: jax.Array  # (E, n)
+    r_tilde: jax.Array  # (E, T), recorded
+    y: jax.Array  # (E, T + 1), recorded
+    smoothed: (
+        jax.Array
+    )  # (E, T + 1), y as it would have been with what disturbed it smoothed over a quarter of an episode
+
+
+class CounterfactualState(NamedTuple):
+    """Differences to the recorded episode, the newest first."""
+
+    dy: jax.Array  # (n,)
+    dr_tilde: jax.Array  # (n,)
+    k: jax.Array  # int32, control steps since the start
+
+
+def fit(data: Record, lags: int) -> CounterfactualParams:
+    """The response by least squares over all episodes, each with a level of its own.
+
+    Args:
+        data: exciting episodes of one plant.
+        lags: n, past samples of y and of r~ on which the next y depends; at most half an episode.
+    """
+    k = np.arange(lags - 1, data.r_tilde.shape[1])
+    past = k[:, None] - np.arange(lags)
+    rows = np.concatenate([data.y[:, past], data.r_tilde[:, past]], -1)  # (E, T - n + 1, 2 n)
+    targets = data.y[:, k + 1]
+    level, level_next = rows.mean(1, keepdims=True), targets.mean(1, keepdims=True)
+    theta = np.linalg.lstsq((rows - level).reshape(-1, 2 * lags), (targets - level_next).ravel(), rcond=None)[0]
+    each = np.broadcast_to(theta, (len(data.y), 2 * lags))
+    smoothed = _smoothed(data.y, targets - rows @ theta, theta[:lags])
+    found = (each[:, :lags], each[:, lags:], data.r_tilde, data.y, smoothed)
+    return CounterfactualParams(*(jnp.asarray(x, float) for x in found))
+
+
+def _smoothed(y: np.ndarray, disturbance: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """`y` (E, T + 1) less what the quick part of the disturbances (E, T - n + 1) of its last samples did to it."""
+    window = min(disturbance.shape[1], y.shape[1] // 4) // 2 * 2 + 1
+    quick = disturbance - savgol_filter(disturbance, window, min(2, window - 1))
+    did = np.asarray(lfilter([1.0], np.append(1.0, -a), quick))
+    return np.concatenate([y[:, : -did.shape[1]], y[:, -did.shape[1] :] - did], 1)
+
+
+def simulated(original: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> CounterfactualParams:
+    """Episodes of a known plant and its response, found by moving r~ for one step; its own `draw` for each.
+
+    Exact, and for a plant with inner steps and delay lines many times faster than stepping it, but only where its
+    response is the same at all times.
+
+    Raises:
+        ValueError: the response half an episode later is another.
+    """
+    *found, early, late = map(np.asarray, _moved(original, params, jax.random.split(key, episodes)))
+    off = np.abs(early[:, : late.shape[1]] - late).max(1)
+    if np.any(off > 1e-3 * np.abs(early).max(1)):
+        raise ValueError(f"plant {original.name!r} responds otherwise half an episode later")
+    return CounterfactualParams(*(jnp.asarray(x, float) for x in (np.zeros_like(early), early, *found)))
+
+
+@partial(jax.jit, static_argnums=0)
+def _moved(original: Plant, params: Any, keys: chex.PRNGKey) -> Any:
+    """r~ and y, y without noise, and the responses to a move of r~ at the start and in the middle; each (E, ...)."""
+    steps, (low, high) = original.episode_steps, original.r_tilde_bounds
+
+    def episode(key: chex.PRNGKey) -> Any:
+        key_draw, key_start, key_run = jax.random.split(key, 3)
+        p = params if original.draw is None else original.draw(key_draw, params)
+        state = original.training_start(key_start, p)
+
+        def y(p: Any, r_tilde: jax.Array) -> jax.Array:
+            return jnp.concatenate([original.output(p, state)[None], simulate(original, p, r_tilde, key_run, state)])
+
+        still = jnp.full(steps, (low + high) / 2)
+        responses = [
+            (y(p, still.at[k].add((high - low) / 2)) - y(p, still))[k + 1 :] / ((high - low) / 2)
+            for k in (0, steps // 2)
+        ]
+        return still, y(p, still), y(original.noise_free(p), still), *responses
+
+    return jax.lax.map(episode, keys, batch_size=256)
+
+
+@cache
+def plant(original: Plant, lags: int) -> Plant:
+    """The plant with the declaration of `original` whose parameters are `CounterfactualParams`; the same each time.
+
+    Each training episode is another view of one of the recorded ones. No longer than they are.
+    """
+
+    def init(key: chex.PRNGKey, params: CounterfactualParams) -> CounterfactualState:
+        del key, params
+        return CounterfactualState(jnp.zeros(lags), jnp.zeros(lags), jnp.zeros((), jnp.int32))
+
+    def output(params: CounterfactualParams, state: CounterfactualState) -> jax.Array:
+        return params.y[state.k] + state.dy[0]
+
+    def step(
+        params: CounterfactualParams, state: CounterfactualState, r_tilde: jax.Array, key: chex.PRNGKey
+    ) -> CounterfactualState:
+        del key
+        dr_tilde = jnp.concatenate([(r_tilde - params.r_tilde[state.k])[None], state.dr_tilde[:-1]])
+        dy = jnp.dot(params.a, state.dy) + jnp.dot(params.b, dr_tilde)
+        return CounterfactualState(jnp.concatenate([dy[None], state.dy[:-1]]), dr_tilde, state.k + 1)
+
+    def draw(key: chex.PRNGKey, params: CounterfactualParams) -> CounterfactualParams:
+        episode = jax.random.randint(key, (), 0, params.y.shape[0])
+        return jax.tree.map(lambda leaf: leaf[episode], params)
+
+    def smooth(params: CounterfactualParams) -> CounterfactualParams:
+        return params._replace(y=params.smoothed)
+
+    rest: dict[str, Any] = dict(start=None, members=None, reuse=lambda old, fresh: fresh, noise_free=smooth)
+    rest |= dict(variables=float_leaves, settled=with_float_leaves, smallest=lambda params: params)
+    return replace(original, init=init, step=step, output=output, draw=draw, **rest)

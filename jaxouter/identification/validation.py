@@ -1,0 +1,266 @@
+"""How far a log can be trusted: what its models predict of rows they have not seen, and where it does not excite."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal
+
+from jaxouter.identification.identify import gain, settling, step_response
+from jaxouter.identification.recorded_data import Ensemble, Log, free_run, without_last_quarter
+from jaxouter.plants.arx import Model
+
+Intervals = tuple[tuple[float, float], ...]
+
+LONGEST_RUN = 1_000  # rows of a free run
+BINS = 20  # levels of r~
+COHERENT = 0.5  # from this on y shows r~ rather than noise
+PATHS = 10  # of noise for each member
+SPREAD = (0.05, 0.95)  # quantiles of the ensemble that are told
+QUANTILES = 8  # levels of y by which the error may differ
+
+
+class Curves(NamedTuple):
+    """What the picture is drawn from."""
+
+    time: np.ndarray  # (T,), of the held-out free run
+    y: np.ndarray  # (T,)
+    free_run: np.ndarray  # (T,)
+    band: np.ndarray  # (2, T), 90 % of the ensemble with its noise
+    responses: np.ndarray  # (members + 1, S), to a unit step of r~ at 0; the nominal one first
+    levels: np.ndarray  # (BINS,), share of the time that r~ was there
+    edges: np.ndarray  # (BINS + 1,)
+    frequency: np.ndarray  # (F,), in cycles a unit of time
+    coherence: np.ndarray  # (F,)
+    power: np.ndarray  # (F,), of r~
+
+
+class Report(NamedTuple):
+    """What a log tells; times in its unit of time, frequencies in cycles a unit of time."""
+
+    rows: int
+    control_step: float
+    order: int
+    dead_time: float
+    gain: float  # DC gain
+    gain_range: tuple[float, float]  # 90 % of the ensemble
+    rise_time: float  # 10 to 90 % of a step
+    settling_time: float  # to 5 % of a step
+    length: float  # of the log, in settling times
+    moves: int  # of r~
+    moves_held_out: int  # of them in the last quarter
+    error_one_step: float  # on the last quarter, by a model of the rest: RMSE
+    error_free_run: float
+    fit_one_step: float  # share of the variance of y that is told
+    fit_free_run: float
+    coverage: float  # share of that quarter's y within the band that should hold 90 %
+    bias: float  # mean error of that free run, in standard deviations of y
+    nonlinearity: float  # part of the error of a free run that depends on the level of y, likewise
+    levels_seen: float  # share of the range of r~
+    levels_unseen: Intervals
+    needed: float  # frequencies up to here matter: one over the rise time
+    excited: Intervals  # frequencies at which y shows r~
+    excited_share: float  # of what is needed
+    redrawn: int  # members that were unstable
+    warnings: tuple[str, ...]
+    curves: Curves
+
+
+def report(log: Log, models: Ensemble, seed: int = 0) -> Report:
+    """What a log tells, and how far it can be trusted.
+
+    The errors are those of the models of its first three quarters on the last one, which had no part in the choice of
+    order and dead time either.
+
+    Args:
+        log: as `read` gives it.
+        models: of the whole log.
+        seed: of blocks and noise.
+    """
+    cut = 3 * len(log.time) // 4
+    tried = without_last_quarter(log, models, seed)
+    rows = min(len(log.time) - cut, LONGEST_RUN)
+    y, told = log.y[cut : cut + rows], free_run(tried.nominal, log, cut, rows)
+    one_step = _one_step(tried.nominal, log, cut)
+    band = _band(tried, log, cut, rows, np.random.default_rng(seed))
+    spread, of_these = float(np.std(log.y)), max(float(np.std(log.y[cut:])), 1e-9 * float(np.std(log.y)))
+    settled = max(settling(models.nominal), 1)
+    rise = _rise(models.nominal, settled)
+    gains = np.quantile([gain(model) for model in models.members], SPREAD)
+    levels, edges = np.histogram(log.r_tilde, BINS)
+    frequency, coherence, power = _excitation(log, settled)
+    needed = 1.0 / (rise * log.step)
+    matter = frequency <= max(needed, frequency[0])
+    unweighed = Report(
+        rows=len(log.time),
+        control_step=log.step,
+        order=models.order,
+        dead_time=models.dead * log.step,
+        gain=gain(models.nominal),
+        gain_range=(float(gains[0]), float(gains[1])),
+        rise_time=rise * log.step,
+        settling_time=settled * log.step,
+        length=len(log.time) / settled,
+        moves=int(np.count_nonzero(np.diff(log.r_tilde))),
+        moves_held_out=int(np.count_nonzero(np.diff(log.r_tilde[cut:]))),
+        error_one_step=_root_mean_square(one_step),
+        error_free_run=_root_mean_square(y - told),
+        fit_one_step=1.0 - (_root_mean_square(one_step) / of_these) ** 2,
+        fit_free_run=1.0 - (_root_mean_square(y - told) / of_these) ** 2,
+        coverage=float(np.mean((y >= band[0]) & (y <= band[1]))),
+        bias=float(np.mean(y - told)) / spread,
+        nonlinearity=_nonlinearity(models.nominal, log, settled) / spread,
+        levels_seen=float(np.mean(levels > 0)),
+        levels_unseen=_runs(levels == 0, edges),
+        needed=needed,
+        excited=_runs(coherence > COHERENT, _edges(frequency)),
+        excited_share=float(np.mean(coherence[matter] > COHERENT)),
+        redrawn=models.redrawn,
+        warnings=(),
+        curves=Curves(
+            time=log.time[cut : cut + rows],
+            y=y,
+            free_run=told,
+            band=band,
+            responses=np.stack([step_response(model, 2 * settled + 2) for model in (models.nominal, *models.members)]),
+            levels=levels / len(log.r_tilde),
+            edges=edges,
+            frequency=frequency,
+            coherence=coherence,
+            power=power,
+        ),
+    )
+    return unweighed._replace(warnings=tuple(_warnings(unweighed)))
+
+
+def _root_mean_square(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def _one_step(model: Model, log: Log, first: int) -> np.ndarray:
+    """What the model does not tell a step ahead, of the rows from `first` on."""
+    of_y = signal.lfilter(np.append(1.0, -model.a), [1.0], log.y)
+    of_r_tilde = signal.lfilter(np.append(0.0, model.b), [1.0], log.r_tilde)
+    return (np.asarray(of_y) - np.asarray(of_r_tilde))[first:] - model.c
+
+
+def _band(models: Ensemble, log: Log, first: int, rows: int, rng: np.random.Generator) -> np.ndarray:
+    """Quantiles of what the members with their noise make of the rows from `first` on; (2, rows)."""
+    paths = [
+        free_run(model, log, first, rows)
+        + signal.lfilter([1.0], np.append(1.0, -model.a), model.sigma * rng.standard_normal((PATHS, rows)))
+        for model in models.members
+    ]
+    return np.quantile(np.concatenate(paths), SPREAD, axis=0)
+
+
+def _rise(model: Model, settled: int) -> int:
+    """Control steps from 10 to 90 % of a step, at least one."""
+    share = step_response(model, settled + len(model.b) + 2) / gain(model)
+    return max(1, int(np.argmax(share >= 0.9) - np.argmax(share >= 0.1)))
+
+
+def _excitation(log: Log, settled: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frequencies above zero, coherence of r~ and y, and power of r~, from segments of four settling times or less."""
+    segment = min(max(4 * settled, 32), len(log.time) // 8)
+    rate = 1.0 / log.step
+    with np.errstate(invalid="ignore", divide="ignore"):
+        frequency, coherence = signal.coherence(log.r_tilde, log.y, rate, nperseg=segment)
+    power = signal.welch(log.r_tilde, rate, nperseg=segment)[1]
+    return frequency[1:], np.nan_to_num(coherence[1:]), power[1:]
+
+
+def _nonlinearity(model: Model, log: Log, settled: int) -> float:
+    """Root mean square of the mean error of a free run at each level, beyond what chance makes of it."""
+    first = min(len(model.b) + settled, len(log.time) // 2)
+    told = free_run(model, log, first, len(log.time) - first)
+    error = log.y[first:] - told
+    error = error - error.mean()
+    of_level = np.searchsorted(np.unique(np.quantile(told, np.linspace(0.0, 1.0, QUANTILES + 1)[1:-1])), told)
+    rows = np.bincount(of_level)
+    means = np.bincount(of_level, error) / np.maximum(rows, 1)
+    chance = np.var(error) * QUANTILES * settled / len(error)
+    return float(np.sqrt(max(np.dot(rows, means**2) / len(error) - chance, 0.0)))
+
+
+def _edges(centres: np.ndarray) -> np.ndarray:
+    half = np.diff(centres[:2]).sum() / 2.0
+    return np.append(centres - half, centres[-1] + half)
+
+
+def _runs(true: np.ndarray, edges: np.ndarray) -> Intervals:
+    """Where a condition holds, as intervals between the edges of its bins."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(int)))
+    return tuple((float(edges[a]), float(edges[b])) for a, b in zip(change[::2], change[1::2], strict=True))
+
+
+def _told(intervals: Sequence[tuple[float, float]]) -> str:
+    return ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals)
+
+
+def _gaps(report: Report) -> Intervals:
+    """Frequencies that matter at which y does not show r~."""
+    frequency, coherence = report.curves.frequency, report.curves.coherence
+    matter = frequency <= max(report.needed, frequency[0])
+    return _runs(coherence[matter] <= COHERENT, _edges(frequency)[: np.count_nonzero(matter) + 1])
+
+
+def _warnings(it: Report) -> list[str]:
+    """What is weak, and what to do about it."""
+    low, high = it.gain_range
+    weak = {
+        f"the log is only {it.length:.3g} settling times long; 20 or more show how much the models may differ": (
+            it.length < 20
+        ),
+        f"r~ moves only {it.moves} times; each move is one look at how y answers, so move it 20 times or more": (
+            it.moves < 20
+        ),
+        f"the DC gain is known to {low:.3g} to {high:.3g} only; hold r~ at several levels until y has settled": (
+            high - low > 0.2 * abs(it.gain)
+        ),
+        f"r~ moves only {it.moves_held_out} times in the last quarter; what is predicted there says little": (
+            it.moves_held_out < 3
+        ),
+        f"r~ was never at {_told(it.levels_unseen)}; whether y is as linear there is a guess": it.levels_seen < 0.7,
+        f"y does not show r~ at the frequencies {_told(_gaps(it))} (coherence below {COHERENT:g}), of those up to "
+        f"{it.needed:.3g} that an outer loop needs; let r~ move at such rates, or further": it.excited_share < 0.8,
+        f"a model of the rest tells only {max(it.fit_free_run, 0.0):.0%} of the variance of y in the last quarter, in "
+        "free run; a controller from it is a guess": it.fit_free_run < 0.8,
+        f"only {it.coverage:.0%} of the last quarter lies where the ensemble expects 90 %; the plant differs from it "
+        "by more than the ensemble spreads": it.coverage < 0.75 and it.fit_free_run < 0.999,
+        f"in the last quarter y is off by {abs(it.bias):.2g} of its standard deviation on the mean: a load, or a "
+        "drift, that the ensemble does not know": abs(it.bias) > 0.2,
+        f"the error depends on the level of y, by {it.nonlinearity:.2g} of its standard deviation: the plant is not "
+        "linear; keep set-points to a narrower range": it.nonlinearity > 0.05,
+        f"{it.redrawn} members were unstable and drawn again": it.redrawn > 0,
+        "y rises within two control steps; a shorter step would show how": it.rise_time < 2.5 * it.control_step,
+        f"y takes {it.rise_time / it.control_step:.0f} control steps to rise; with every n-th row of the log, so that "
+        "it takes 5 to 20, the outer loop would see further back": it.rise_time > 150 * it.control_step,
+    }
+    return [text for text, is_weak in weak.items() if is_weak]
+
+
+def table(report: Report, y_unit: str = "1", time_unit: str = "s") -> list[tuple[str, str]]:
+    """The report as rows of a table: what, and how much."""
+    y, t = "" if y_unit in ("", "1") else f" {y_unit}", time_unit
+    low, high = report.gain_range
+    return [
+        ("rows", f"{report.rows} of {report.control_step:.3g} {t}, {report.length:.3g} settling times"),
+        ("model", f"order {report.order}, dead time {report.dead_time:.3g} {t}"),
+        ("DC gain", f"{report.gain:.3g} ({low:.3g} to {high:.3g})"),
+        ("rise, settling", f"{report.rise_time:.3g} {t}, {report.settling_time:.3g} {t}"),
+        (
+            "held out, one step",
+            f"RMSE {report.error_one_step:.3g}{y}, {max(report.fit_one_step, 0.0):.1%} of the variance",
+        ),
+        (
+            "held out, free run",
+            f"RMSE {report.error_free_run:.3g}{y}, {max(report.fit_free_run, 0.0):.1%} of the variance",
+        ),
+        ("held out, in the band of 90 %", f"{report.coverage:.0%}"),
+        ("levels of r~ seen", f"{report.levels_seen:.0%}, {report.moves} moves"),
+        ("frequencies shown", f"{report.excited_share:.0%} of those up to {report.needed:.3g} /{t}"),
+        ("error by the level of y", f"{report.nonlinearity:.2g} of its standard deviation"),
+    ]

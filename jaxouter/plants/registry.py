@@ -1,0 +1,226 @@
+"""Plants by reference: what a command line may name in place of `pitch` or `heaters`.
+
+`FILE.py:NAME` is a plant of one's own, in a file: a function that returns the plant and its parameters, as
+`jaxouter.plants.pitch.make` does. An installed package may offer one as an entry point of the group `jaxouter.plants`.
+`gym:ID` and `fmu:FILE` are simulated elsewhere; `log:FILE` is what a record of r~ and y tells of a plant.
+
+A plant is imported only because a command line names it, never because a run folder does. It is then known by a short
+name, in scenarios (`Tank/steps`) and in folders (`runs/Tank-default-0`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import logging
+import pkgutil
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache, wraps
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from jaxouter import plants
+from jaxouter.plants import declaration, interface, simulators
+from jaxouter.plants.base import Plant, float_leaves
+from jaxouter.plants.errors import PlantError, Raised, said
+from jaxouter.plants.simulators import PlantOptions
+
+GROUP = "jaxouter.plants"  # of entry points
+KINDS = {
+    "gym": "jaxouter.plants.simulators:from_gymnasium",
+    "fmu": "jaxouter.plants.simulators:from_fmu",
+    "log": "jaxouter.identification.recorded_data:make",  # by name, for identification stands on the plants
+}
+FORMS = "FILE.py:NAME, gym:ID, fmu:FILE, log:FILE"
+
+
+class Registration(NamedTuple):
+    """Where a plant comes from."""
+
+    reference: str
+    options: PlantOptions
+    sha256: str  # of its file
+
+
+REGISTRATIONS: dict[str, Registration] = {}
+"""By the short name, of all plants that were added."""
+
+
+def attribute(path: Path, name: str, what: str) -> Any:
+    """What a Python file of the user's calls `name`; `what` it is to be is said where it isn't there.
+
+    Raises:
+        ValueError: there is no such file or name, or the file can't be imported.
+    """
+    spec = importlib.util.spec_from_file_location(f"jaxouter_user_{path.stem}", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file; {what} is named FILE.py:NAME")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
+    try:
+        spec.loader.exec_module(module)
+    except Raised as error:
+        raise ValueError(f"{path} can't be imported: {said(error)}") from error
+    if not hasattr(module, name):
+        raise ValueError(f"{path} has no {name!r}")
+    return getattr(module, name)
+
+
+def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa: B008 - frozen
+    """Make the plant that a command line names known, and give its short name, by which `plants.make` finds it.
+
+    Raises:
+        ValueError: there is none, it breaks the contract, or its short name is another plant's.
+    """
+    if reference in plants.REGISTRY and reference not in REGISTRATIONS:
+        _plain(reference, options)
+        return reference
+    name, make, path = _find(reference, options)
+    source = Registration(reference, options, hashlib.sha256(path.read_bytes()).hexdigest())
+    if REGISTRATIONS.get(name, source) != source or (name in plants.REGISTRY and name not in REGISTRATIONS):
+        other = REGISTRATIONS[name].reference if name in REGISTRATIONS else "a built-in plant"
+        raise ValueError(f"{reference} has the short name {name!r}, which is that of {other}; rename it")
+    if name not in REGISTRATIONS:
+        try:
+            made = make()
+            plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
+            interface.shapes(plant, params)
+        except ValueError as error:
+            raise ValueError(f"{reference}: {error}") from error
+        except Raised as error:
+            raise ValueError(f"{reference} can't be made: {said(error)}") from error
+        plants.REGISTRY[name] = make
+        REGISTRATIONS[name] = source
+    return name
+
+
+def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tuple[Plant, Any]], Path]:
+    """Short name, maker and file of a plant."""
+    kind, _, rest = reference.partition(":")
+    if kind in KINDS:
+        make, path = pkgutil.resolve_name(KINDS[kind]), simulators.file_of(rest) if kind == "gym" else Path(rest)
+        if not path.is_file():
+            raise ValueError(f"{reference}: there is no file {rest}")
+        name = _short(re.split("[/:]", rest)[-1] if kind == "gym" else path.stem)
+        return name, cache(lambda: make(name, rest, options)), path
+    _plain(reference, options)
+    file, colon, name = reference.rpartition(":")
+    if colon and file.endswith(".py"):
+        return name, _named(name, attribute(Path(file), name, "a plant of your own")), Path(file)
+    offered = list(entry_points(group=GROUP, name=reference))
+    if not offered:
+        known = dict.fromkeys([*plants.REGISTRY, *(point.name for point in entry_points(group=GROUP))])
+        raise ValueError(f"there is no plant {reference!r}; the plants are: {', '.join(known)}, and {FORMS}")
+    try:
+        make = offered[0].load()
+    except Raised as error:
+        raise ValueError(f"{reference} can't be imported: {said(error)}") from error
+    return reference, _named(reference, make), Path(inspect.getsourcefile(make) or "")
+
+
+def _plain(reference: str, options: PlantOptions) -> None:
+    if options != PlantOptions():
+        raise ValueError(
+            f"{reference} declares itself; options such as --y-index and --input are for gym:, fmu: and log:"
+        )
+
+
+def _short(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text) or "plant"
+
+
+def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., tuple[Plant, Any]]:
+    """The same maker, whose plant has this name: one that equals itself, however often it is made."""
+    if not callable(make):
+        raise ValueError(f"{name} is {make!r}; it must be a function that returns a plant and its parameters")
+
+    @cache
+    def known(plant: Plant) -> Plant:
+        return _guarded(replace(plant, name=name))
+
+    @cache
+    def made() -> Any:
+        return make()
+
+    @wraps(make)
+    def named(**overrides: Any) -> Any:
+        found = make(**overrides) if overrides else made()
+        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Plant):
+            return known(found[0]), found[1]
+        return found
+
+    return named
+
+
+def _guarded(plant: Plant) -> Plant:
+    """The same plant, whose functions say by which of them an error was made."""
+    own = [name for name, kind in declaration.PLANT.items() if kind.function and callable(getattr(plant, name))]
+    if plant.variables is float_leaves:
+        own = [name for name in own if name not in ("variables", "settled")]
+
+    def guarded(name: str) -> Callable[..., Any]:
+        function = getattr(plant, name)
+
+        @wraps(function)
+        def call(*args: Any) -> Any:
+            try:
+                return function(*args)
+            except PlantError:
+                raise
+            except Raised as error:
+                raise PlantError(plant.name, f"in its function {name}", said(error)) from error
+
+        return call
+
+    return replace(plant, **{name: guarded(name) for name in own})
+
+
+class _Kept(logging.Filter):
+    """Keeps the last exception that JAX logs, and lets none be written."""
+
+    last: BaseException | None = None
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        self.last = error or self.last
+        return error is None
+
+
+CALLBACKS = ("jax._src.callback", "jax._src.debugging")
+"""Loggers to which JAX tells what a function raised that it called back."""
+
+
+@contextmanager
+def own_errors() -> Iterator[None]:
+    """What a plant's code raises where JAX calls it back comes out as it was raised, not in the wrappings of XLA.
+
+    Raises:
+        PlantError: it did.
+        KeyboardInterrupt: it was interrupted.
+    """
+    kept, loggers = _Kept(), [logging.getLogger(name) for name in CALLBACKS]
+    for logger in loggers:
+        logger.filters.insert(0, kept)  # before that of a block around this one
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises one or the other
+        last = kept.last
+        if isinstance(error, PlantError) or "callback" not in str(error):
+            raise
+        if isinstance(last, PlantError):
+            raise last from last.__cause__
+        if isinstance(last, KeyboardInterrupt):  # Ctrl-C while a plant was stepped
+            raise last from None
+        what = str(error).strip().splitlines()[-1] if last is None else said(last)
+        raise PlantError(", ".join(REGISTRATIONS), "in a function that JAX calls back", what) from error
+    finally:
+        for logger in loggers:
+            logger.removeFilter(kept)

@@ -1,0 +1,323 @@
+"""Environments for learners that step through Gymnasium; needs the extra `gymnasium`.
+
+    import jaxouter.runtime.gymnasium  # registers jaxouter/Pitch-v0 and jaxouter/Heaters-v0
+
+    env = gymnasium.make("jaxouter/Pitch-v0", tau=0.5)
+    envs = gymnasium.make_vec("jaxouter/Pitch-v0", num_envs=64, tau=0.5)
+
+They are `jaxouter.loop.environment` with NumPy at its edges. Gymnasium has no plug-ins since 1.0: it knows an id after
+this import, or with the module before it, `gymnasium.make("jaxouter.runtime.gymnasium:jaxouter/Pitch-v0")`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter import plants
+from jaxouter.loop.environment import Environment, EnvParams, EnvState, make
+from jaxouter.loop.observation import Memory
+
+try:
+    import gymnasium
+    from gymnasium.utils import seeding
+except ImportError as error:
+    raise ImportError('jaxouter.runtime.gymnasium needs Gymnasium: pip install "jaxouter[gymnasium]"') from error
+
+
+def observation_bounds(env: Environment) -> tuple[jax.Array, jax.Array]:
+    """Least and greatest observation while r and y lie within the plant's `divergence_bounds`; each (3 + 2H,).
+
+    An episode ends where y leaves them. The leaky integral is a running mean of r - y from 0, so it has its bounds.
+    """
+    limits = jnp.asarray(env.plant.divergence_bounds, float)
+    r_tilde = jnp.asarray(env.plant.r_tilde_bounds, float)
+    shape = (env.observer.history,)
+
+    def extreme(r: jax.Array, y: jax.Array, r_tilde: jax.Array) -> jax.Array:
+        # Every feature is monotone: it rises with r, past y, past r~ and the integral, and falls with y.
+        return env.observer.features(Memory(jnp.full(shape, r), jnp.full(shape, r_tilde), r - y), r, y)
+
+    return extreme(limits[0], limits[1], r_tilde[0]), extreme(limits[1], limits[0], r_tilde[1])
+
+
+def _seen(env: Environment, obs: jax.Array, state: EnvState) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The observation within its bounds, which rounding, sensor noise or a far goal may pass, and info."""
+    info = {"r": state.r, "y": state.y_seen, "r_tilde": state.memory.r_tilde_past[0]}
+    return jnp.clip(obs, *observation_bounds(env)), info
+
+
+# Compiled once for all instances with the same plant, observer and goal, whatever their parameters.
+@partial(jax.jit, static_argnums=0)
+def _reset(env: Environment, params: EnvParams, seed: np.uint32) -> tuple[Any, Any]:
+    key, key_reset = jax.random.split(jax.random.key(seed))
+    obs, state = env.reset(key_reset, params)
+    return (key, state), _seen(env, obs, state)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(
+    env: Environment, params: EnvParams, carry: tuple[chex.PRNGKey, EnvState], action: np.ndarray
+) -> tuple[Any, Any, Any]:
+    key, key_step = jax.random.split(carry[0])
+    low, high = env.plant.r_tilde_bounds
+    r_tilde = (low + high) / 2 + (high - low) / 2 * jnp.asarray(action[0], float)
+    obs, state, reward, terminated, truncated, _ = env.step_env(key_step, carry[1], r_tilde, params)
+    return (key, state), _seen(env, obs, state), (reward, terminated, truncated)
+
+
+@partial(jax.jit, static_argnums=0)
+def _resets(env: Environment, params: EnvParams, seeds: np.ndarray, chosen: np.ndarray, before: Any) -> Any:
+    """New episodes where chosen, (n,) bool; elsewhere what there was before. If that is None, everywhere."""
+    new = jax.vmap(lambda seed: _reset(env, params, seed))(seeds)
+    if before is None:
+        return new
+    return jax.vmap(lambda here, *both: jax.tree.map(partial(jnp.where, here), *both))(chosen, new, before)
+
+
+@partial(jax.jit, static_argnums=0)
+def _steps(env: Environment, params: EnvParams, carry: Any, actions: np.ndarray) -> Any:
+    return jax.vmap(lambda carry, action: _step(env, params, carry, action))(carry, actions)
+
+
+def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tuple[Environment, EnvParams]:
+    if render_mode is not None:  # stable-baselines3 asks for one, and goes without it on this error alone
+        raise TypeError(f"render_mode is {render_mode!r}; there is nothing to render, so it must be None")
+    return make(plant, **settings)
+
+
+def _spaces(env: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of the observations and of the actions of one loop."""
+    low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(env))
+    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+
+def _draw(generator: np.random.Generator) -> np.uint32:
+    """What an episode's key is made of."""
+    return generator.integers(2**32, dtype=np.uint32)
+
+
+def _checked(carry: Any, action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The action, if a step can be made with it."""
+    if carry is None:
+        raise gymnasium.error.ResetNeeded("step was called before the first reset; call reset first")
+    action = np.asarray(action)
+    if action.shape != shape or not np.isfinite(action).all():
+        raise ValueError(f"action is {action!r}; it must be finite numbers in an array of shape {shape}")
+    return action
+
+
+def _array(obs: np.ndarray) -> np.ndarray:
+    """A copy that the caller may write to, in the type of the space also under x64."""
+    return np.array(obs, np.float32)
+
+
+class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The outer loop around one plant: sees r and y, chooses r~.
+
+    - Action, (1,): r~ scaled such that -1 and 1 are its bounds in the plant. Learners of continuous actions explore and
+      saturate on that scale, and Gymnasium's checker asks for it. For r~ in the plant's unit:
+      `gymnasium.wrappers.RescaleAction(env, *np.float32(env.functional.plant.r_tilde_bounds))`.
+    - Observation, (3 + 2H,): that of `jaxouter.loop.observation.Observer`, clipped to `observation_bounds`.
+    - End: `terminated` where y diverged, `truncated` at the plant's `episode_steps` (bootstrap there), so it needs no
+      `gymnasium.wrappers.TimeLimit`. It does not reset itself.
+    - Info: r and y as in the observation, and the r~ that led there, in the plant's unit. The reward is of the true y.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": [],
+        "autoreset_mode": gymnasium.vector.AutoresetMode.DISABLED,
+    }
+
+    functional: Environment
+    """The environment without state."""
+    params: EnvParams
+    """Its parameters; others of the same structure (sensor noise, say) may take their place, without recompilation."""
+
+    def __init__(self, plant: str, *, render_mode: str | None = None, **settings: Any) -> None:
+        """Nothing is drawn before `reset`.
+
+        Args:
+            plant: see `jaxouter.plants.make`.
+            render_mode: there is none.
+            **settings: of `jaxouter.make`: history, integral_steps, goal, and parameters of the plant.
+
+        Raises:
+            ValueError: unknown plant or parameter (lists what exists), or a value that does not fit.
+            TypeError: a render_mode is asked for.
+        """
+        self.functional, self.params = _made(plant, render_mode, settings)
+        self.observation_space, self.action_space = _spaces(self.functional)
+        self._carry: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """A new episode: parameters, start and reference are drawn.
+
+        Args:
+            seed: of this and all later episodes; None: go on with the one before.
+            options: there are none.
+
+        Returns:
+            obs (3 + 2H,) float32 and info.
+        """
+        super().reset(seed=seed)
+        del options
+        self._carry, seen = _reset(self.functional, self.params, _draw(self.np_random))
+        obs, info = jax.device_get(seen)
+        return _array(obs), _floats(info)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One control step.
+
+        Args:
+            action: (1,), scaled r~, clipped to [-1, 1].
+
+        Returns:
+            obs (3 + 2H,) float32, reward, terminated, truncated, info.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first `reset`.
+            ValueError: action is not one finite number in an array of shape (1,).
+        """
+        action = _checked(self._carry, action, (1,))
+        self._carry, *after = _step(self.functional, self.params, self._carry, action)
+        (obs, info), (reward, terminated, truncated) = jax.device_get(after)
+        return _array(obs), float(reward), bool(terminated), bool(truncated), _floats(info)
+
+
+def _floats(info: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {name: float(value) for name, value in info.items()}
+
+
+class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many outer loops of one kind, each with a draw of its own, in one compiled call a step.
+
+    All that comes out is what `gymnasium.vector.SyncVectorEnv` over as many `OuterLoop` gives in its mode `SAME_STEP`:
+    where an episode ends, the observation is the first of the next one, the last of the old one stands in
+    `infos["final_obs"]` (bootstrap from it unless terminated), and its info in `infos["final_info"]`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": [],
+        "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
+    }
+
+    functional: Environment
+    """The environment without state, of one loop."""
+    params: EnvParams
+    """Its parameters, of all loops."""
+
+    def __init__(self, plant: str, num_envs: int = 1, *, render_mode: str | None = None, **settings: Any) -> None:
+        """Nothing is drawn before `reset`.
+
+        Args:
+            plant, render_mode, **settings: as `OuterLoop`.
+            num_envs: n, number of loops.
+
+        Raises:
+            ValueError: as `OuterLoop`, or num_envs is below 1.
+            TypeError: a render_mode is asked for.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
+        self.num_envs = num_envs
+        self.functional, self.params = _made(plant, render_mode, settings)
+        self.single_observation_space, self.single_action_space = _spaces(self.functional)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._generators = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._carry: Any = None
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """New episodes of all loops.
+
+        Args:
+            seed: of loop 0, that of loop i is seed + i; or one for each; None: go on with those before.
+            options: there are none.
+
+        Returns:
+            obs (n, 3 + 2H) float32 and infos.
+
+        Raises:
+            ValueError: there is not a seed for each loop.
+        """
+        del options
+        seeds = [seed] * self.num_envs if seed is None else seed
+        seeds = [seeds + i for i in range(self.num_envs)] if isinstance(seeds, int) else seeds
+        if len(seeds) != self.num_envs:
+            raise ValueError(
+                f"seed has {len(seeds)} elements; it must be one number or one for each of {self.num_envs}"
+            )
+        self._generators = [
+            generator if seed is None else seeding.np_random(seed)[0]
+            for generator, seed in zip(self._generators, seeds, strict=True)
+        ]
+        obs, info = self._restart(np.ones(self.num_envs, bool), None)
+        return _array(obs), _infos(info, np.ones(self.num_envs, bool))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step of all loops.
+
+        Args:
+            actions: (n, 1), scaled r~, clipped to [-1, 1].
+
+        Returns:
+            obs (n, 3 + 2H) float32, reward (n,), terminated (n,), truncated (n,), infos.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first `reset`.
+            ValueError: actions are not finite numbers in an array of shape (n, 1).
+        """
+        actions = _checked(self._carry, actions, (self.num_envs, 1))
+        self._carry, seen, outcome = _steps(self.functional, self.params, self._carry, actions)
+        (obs, info), (reward, terminated, truncated) = jax.device_get((seen, outcome))
+        ended, infos = terminated | truncated, {}
+        if ended.any():
+            infos = _batched({"final_obs": _rows(_array(obs), ended), "final_info": _infos(info, ended)}, ended)
+            obs, info = self._restart(ended, (self._carry, seen))
+        infos |= _infos(info, np.ones(self.num_envs, bool))
+        return _array(obs), np.array(reward, float), np.array(terminated), np.array(truncated), infos
+
+    def _restart(self, chosen: np.ndarray, before: Any) -> Any:
+        """What is seen after new episodes were begun where chosen."""
+        seeds = np.zeros(self.num_envs, np.uint32)
+        for i in np.flatnonzero(chosen):
+            seeds[i] = _draw(self._generators[i])
+        self._carry, seen = _resets(self.functional, self.params, seeds, chosen, before)
+        return jax.device_get(seen)
+
+
+def _rows(array: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The chosen rows as objects, None elsewhere; (n,)."""
+    rows = np.full(len(array), None, object)
+    for i in np.flatnonzero(chosen):
+        rows[i] = array[i]
+    return rows
+
+
+def _infos(info: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, Any]:
+    return _batched({name: np.where(chosen, np.array(value, float), 0.0) for name, value in info.items()}, chosen)
+
+
+def _batched(values: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form of infos: beside each value stands who has it."""
+    return values | {f"_{name}": chosen.copy() for name in values}
+
+
+for _plant in plants.REGISTRY:
+    gymnasium.register(
+        f"jaxouter/{_plant.capitalize()}-v0",
+        entry_point=f"{__name__}:OuterLoop",
+        vector_entry_point=f"{__name__}:OuterLoops",
+        kwargs={"plant": _plant},
+    )

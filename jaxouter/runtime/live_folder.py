@@ -1,0 +1,268 @@
+"""What a real-time loop leaves behind: its declaration, its state, a row a control step, a summary."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import msgspec
+import numpy as np
+
+from jaxouter.exports.spec import ControllerSpec
+from jaxouter.identification.columns import read
+from jaxouter.loop.references import FAMILIES
+from jaxouter.plants.simulators import PlantOptions
+from jaxouter.runtime.online import Live, LiveState, declared
+from jaxouter.runtime.realtime import Loop, Row
+from jaxouter.training import checkpoint
+from jaxouter.training.policy import LearnedParams
+from jaxouter.training.run import lock, open_run, write_json
+
+FORMAT = 1
+EPISODES = 64  # of a family of references, after which they come again
+PARTS = {"first quarter": slice(0, 1), "last quarter": slice(3, 4)}  # of four
+SIGNALS = ("y", "y_passed", "y_kept", "y_learned")
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a live folder is about; a trained run says the rest itself."""
+
+    dt: float
+    """Period, s."""
+    seed: int = 0
+    """Of networks, exploration and references."""
+    episode_steps: int = 400
+    """Control steps of a reference."""
+    takeover: int = 2_000
+    """Updates before what is learned may act."""
+    r_tilde_bounds: tuple[float, float] | None = None
+    """From nothing: least and greatest r~ that the loop may be shown."""
+    setpoint_range: tuple[float, float] | None = None
+    """From nothing: between what r lies, as a rule; scales what is seen, and random references."""
+
+    def check(self) -> None:
+        """Raises ValueError, naming option, value and what is allowed."""
+        if not 0.0 < self.dt < math.inf:
+            raise ValueError(f"--dt is {self.dt}; it must be a positive number of seconds")
+        for name in ("episode_steps", "takeover"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"--seed is {self.seed}; it must lie in [0, 2^32)")
+
+
+@dataclass(frozen=True)
+class LiveFolder:
+    """RUN/live."""
+
+    run: Path
+    declaration: Declaration
+
+    @property
+    def path(self) -> Path:
+        """Where everything is written."""
+        return self.run / "live"
+
+    @property
+    def trained(self) -> bool:
+        """Whether there is a run around it."""
+        return is_run(self.run)
+
+    @property
+    def state_file(self) -> Path:
+        """The state, of which it goes on."""
+        return self.path / "state.npz"
+
+    @property
+    def rows_file(self) -> Path:
+        """A row a control step."""
+        return self.path / "steps.csv"
+
+    def begin(self) -> tuple[Live, LiveState]:
+        """What acts and learns, from where it was left, from what the run has learned, or from nothing.
+
+        Raises:
+            ValueError: the run, or the state, is not readable; or the ranges are none.
+        """
+        said, key = self.declaration, jax.random.key(self.declaration.seed)
+        if self.trained:
+            run, seed, _ = open_run(self.run)
+            trainer, _ = run.trainer
+            learned, _ = run.load(seed)
+            live = Live.of(trainer.config, trainer.env, said.takeover, "trained")
+            state = live.trained(key, learned, trainer.agent.actor(learned.agent))
+        else:
+            options = PlantOptions(r_tilde_bounds=said.r_tilde_bounds, setpoint_range=said.setpoint_range)
+            live = Live.of(*declared(said.dt, said.episode_steps, options), said.takeover, "static")
+            state = live.fresh(key)
+        return live, checkpoint.load(self.state_file, state)[0] if self.state_file.exists() else state
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """The folder, made where it is not there, for this process alone.
+
+        Raises:
+            ValueError: it can't be made, or another process has it.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"the folder {self.path} can't be made: {error.strerror}") from None
+        with lock(self.path):
+            write_json(self.path / "config.json", {"format": FORMAT, "live": asdict(self.declaration)})
+            yield
+
+    @contextmanager
+    def rows(self) -> Iterator[Any]:
+        """Writer of rows, each there as soon as it is written."""
+        before = self.rows_file.read_bytes()[-1:] if self.rows_file.exists() else b""
+        with self.rows_file.open("a", newline="", buffering=1) as file:
+            writer = csv.writer(file, lineterminator="\n")
+            if not before:
+                writer.writerow(Row._fields)
+            elif before != b"\n":  # a kill cut the last row
+                file.write("\n")
+            yield writer
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """All rows, by column; nan where there is none."""
+        if not self.rows_file.exists():
+            return {}
+        with self.rows_file.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if None not in row.values()]  # a kill may cut the last one
+        return {
+            name: np.array([row[name] for row in rows])
+            if name == "why"
+            else np.array([float(row[name] or math.nan) for row in rows])
+            for name in Row._fields
+        }
+
+    def save(self, loop: Loop) -> None:
+        """State, and the controller that acts.
+
+        Raises:
+            OSError: they can't be written; what was there is whole.
+        """
+        state = loop.state
+        checkpoint.save(self.state_file, state)
+        if state.begun:
+            live = loop.live
+            actor = live.agent.actor(state.agent) if state.leads else state.kept
+            spec = ControllerSpec.of(live.policy, LearnedParams(actor, state.base), live.env.plant)
+            spec.save(self.path / "controller.npz")
+
+
+def is_run(path: Path) -> bool:
+    """Whether the folder is a run, or a seed of one."""
+    return (path / "config.json").exists() or (path.name.startswith("seed-") and (path / "../config.json").exists())
+
+
+def open_folder(run: Path, given: Declaration, learn: bool) -> LiveFolder:
+    """The live folder of a run, whose declaration must be what it was.
+
+    Raises:
+        ValueError: the declaration is another one, or there is nothing that acts and it is not to learn.
+    """
+    given.check()
+    folder, file = LiveFolder(run, given), run / "live" / "config.json"
+    if folder.trained:
+        if given.r_tilde_bounds or given.setpoint_range:
+            raise ValueError(f"{run} says itself between what r~ and set-points lie; leave these options away")
+    elif not file.exists():
+        if run.exists() and (not run.is_dir() or any(run.iterdir())):
+            raise ValueError(f"{run} is not a run folder: it has no readable config.json")
+        if not learn:
+            raise ValueError(f"there is no run {run}; train one, or begin one from nothing by --learn")
+        if given.r_tilde_bounds is None or given.setpoint_range is None:
+            raise ValueError(
+                "a loop of which nothing is known takes --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"
+            )
+    if not file.exists():
+        return folder
+    was = _read(file)
+    for name, value in asdict(given).items():
+        if value != getattr(was, name) and (name == "dt" or value != getattr(Declaration(given.dt), name)):
+            raise ValueError(f"{name} is {value}; {folder.path} was made with {getattr(was, name)}")
+    return LiveFolder(run, was)
+
+
+def _read(path: Path) -> Declaration:
+    try:
+        content = json.loads(path.read_text())
+        if content["format"] != FORMAT:
+            raise ValueError(f"it is not of format {FORMAT}")
+        return msgspec.convert(content["live"], Declaration)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path} is not readable: {error}") from None
+
+
+def reference(text: str, setpoint_range: tuple[float, float], steps: int, seed: int) -> np.ndarray:
+    """A cycle of references: a number, the column r of a CSV file, or a family, 64 times drawn.
+
+    Raises:
+        ValueError: it is none of them.
+    """
+    if text in FAMILIES:
+        keys = jax.random.split(jax.random.key(seed), EPISODES)
+        drawn = jax.vmap(lambda key: FAMILIES[text](key, steps, *setpoint_range))(keys)
+        return np.asarray(drawn, np.float64).ravel()
+    cycle = _column(Path(text)) if text.lower().endswith(".csv") else _number(text)
+    if not len(cycle) or not np.isfinite(cycle).all():
+        raise ValueError(f"--reference is {text!r}; it must be finite numbers")
+    return cycle
+
+
+def _number(text: str) -> np.ndarray:
+    try:
+        return np.array([float(text)])
+    except ValueError:
+        forms = f"a number, a CSV file with a column r, or one of {', '.join(FAMILIES)}"
+        raise ValueError(f"--reference is {text!r}; it must be {forms}") from None
+
+
+def _column(path: Path) -> np.ndarray:
+    try:
+        return read(path, ("r",))[0]
+    except ValueError as error:
+        raise ValueError(f"--reference: {error}") from None
+
+
+def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What the loop has come to, after a step at least.
+
+    MAE is of what came, and of what the record tells of the others on the same steps; `act_us` and `sent_back` are
+    since the start of this process.
+    """
+    p50, p99 = np.percentile(1e6 * np.asarray(loop.act_seconds), (50, 99)).tolist()
+    slope, offset = (float(value) for value in loop.state.base)
+    return {
+        "format": FORMAT,
+        "steps": loop.steps,
+        "missed_deadlines": loop.counts["late"],
+        "counts": loop.counts,
+        "updates": loop.updates,
+        "sent_back": loop.sent_back,
+        "act_us": {"p50": p50, "p99": p99},
+        "base": {"slope": slope, "offset": offset},
+        "mae": {part: maes(columns, quarters) for part, quarters in PARTS.items()},
+    }
+
+
+def maes(columns: Mapping[str, np.ndarray], quarters: slice) -> dict[str, float | None]:
+    """Mean of |r_k - y_(k+1)| over some quarters of the rows; None where that is not known for half of them."""
+    edges = [i * max(0, len(columns["r"]) - 1) // 4 for i in range(5)]
+    k = np.arange(edges[quarters.start], edges[quarters.stop])
+    follows = k[columns["step"][k + 1] == columns["step"][k] + 1]
+    out: dict[str, float | None] = {}
+    for name in SIGNALS:
+        e = np.abs(columns["r"][follows] - columns[name][follows + 1])
+        out[name] = float(np.nanmean(e)) if np.isfinite(e).sum() > len(e) / 2 else None
+    return out

@@ -1,0 +1,341 @@
+"""What acts and learns in a real-time loop: pure functions of parts of one state, jitted.
+
+From nothing r passes through while a record is made; then the static inverse of that record acts, and then what was
+learned on top of it. A trained policy acts as it is, and then what was learned since. `jaxouter.runtime.realtime` is
+the loop in time.
+
+Once the response of y to a change of r~ is known, each step is replayed under other r~
+(`jaxouter.identification.counterfactual`), at no cost to the plant. Three of these replays tell what passing r through,
+the fallback and the learned policy would have achieved; the rest explore.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple, cast
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.agents import AgentConfig, OffPolicy, noise
+from jaxouter.agents.agent import OffPolicyAgent
+from jaxouter.agents.replay import Replay, ReplayState
+from jaxouter.identification import identify
+from jaxouter.identification.identify import Record
+from jaxouter.loop import rewards
+from jaxouter.loop.environment import Environment
+from jaxouter.loop.observation import Memory, Observer, Signals
+from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.references import SetPoint
+from jaxouter.plants import arx
+from jaxouter.plants.arx import Model
+from jaxouter.plants.simulators import PlantOptions
+from jaxouter.runtime.controller import Reason
+from jaxouter.tasks.presets import LIVE
+from jaxouter.training.config import TrainConfig, configured, preset
+from jaxouter.training.environments import TrainState
+from jaxouter.training.off_policy import FIELDS, batch
+from jaxouter.training.policy import LearnedPolicy
+
+Kept = Literal["static", "trained"]
+Stage = Literal["recording", "learned"] | Kept
+Why = Stage | Reason
+WHYS: tuple[Why, ...] = ("recording", "static", "trained", "learned", "late", "missing", "not finite", "out of range")
+NAME = "live"
+FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y comes to r~ at once
+HISTORY = 8  # where nothing else is known
+COMPARED = 3  # of the others: r passes through; the policy that was kept; what was learned, without exploration
+EXPLORING = 12  # of the others
+SIGMA, THETA = (0.0125, 0.1), 0.15  # exploration of the loop itself, and of the last replay: as in `ornstein_uhlenbeck`
+REDRAW = 0.02  # probability that one of these gets another set-point at a step
+KEPT = 20_000  # control steps in the replay
+RECENT = 2_000  # of them, from which the response is identified
+AGREE = 0.2  # by which the gains of both halves of the record may differ, as share of that of the whole
+
+
+class Sample(NamedTuple):
+    """What came at t_k and what was answered; scalars but for the memory."""
+
+    memory: Memory  # e_k integrated
+    r: jax.Array
+    y: jax.Array
+    r_tilde: jax.Array
+    age: jax.Array  # int32, control steps since the last interruption
+
+
+class Response(NamedTuple):
+    """Of y to a change of r~: dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i); zero while it is not known."""
+
+    a: jax.Array  # (H,)
+    b: jax.Array  # (H,)
+
+
+class Others(NamedTuple):
+    """Who lives the same steps under another r~; each leaf (O, ...)."""
+
+    sample: Sample
+    dy: jax.Array  # (O, H), differences to what came, the newest first
+    dr_tilde: jax.Array  # (O, H)
+    noise: jax.Array  # (O,), exploration
+
+
+class LiveState(NamedTuple):
+    """Everything that a live loop changes."""
+
+    agent: Any
+    replay: ReplayState
+    base: AffineParams  # r~ of a zero action
+    kept: Any  # actor from the beginning, to fall back on; of zeros it is the static inverse
+    begun: jax.Array  # bool, whether the base is more than r~ = r
+    leads: jax.Array  # bool, whether what was learned acts
+    response: Response
+    sample: Sample  # the last one
+    others: Others
+    noise: jax.Array  # exploration, 1 is half the range of r~
+    key: chex.PRNGKey
+    updates: jax.Array  # int32, of the agent
+    counts: jax.Array  # (len(WHYS),), int32, control steps by what decided them
+
+
+@dataclass(frozen=True)
+class Live:
+    """What acts and learns. Static and hashable."""
+
+    env: Environment  # which nobody steps
+    policy: LearnedPolicy
+    agent: OffPolicyAgent
+    data: OffPolicy
+    reward_scale: float
+    replay: Replay
+    takeover: int
+    """Updates before what was learned acts."""
+    kept: Kept
+    """What acts before it."""
+
+    @classmethod
+    def of(cls, config: TrainConfig, env: Environment, takeover: int, kept: Kept) -> Live:
+        """For the configuration and the environment of a run, or of `declared`.
+
+        Args:
+            config, env: agent and observation. One that learns on-policy is followed by the default off-policy agent,
+                with the actor that it has learned.
+            takeover: updates before what was learned acts; for half of them the actor stays as it is.
+            kept: what acts before it.
+        """
+        chosen = config.agent
+        if not isinstance(chosen.data, OffPolicy):
+            chosen = cast(AgentConfig, replace(cast(Any, preset(config.plant).agent), hidden=chosen.hidden))
+        agent = cast(OffPolicyAgent, chosen.build(env.observer.size)).endless(takeover // 2)
+        policy = LearnedPolicy(env.observer, chosen.hidden)
+        replay = Replay(FIELDS, 1 + COMPARED + EXPLORING, KEPT, env.observer.history)
+        scale = config.reward_scale / env.plant.error_scale
+        return cls(env, policy, agent, cast(OffPolicy, agent.data), scale, replay, takeover, kept)
+
+    @property
+    def observer(self) -> Observer:
+        """What is seen."""
+        return self.env.observer
+
+    @partial(jax.jit, static_argnums=0)
+    def fresh(self, key: chex.PRNGKey) -> LiveState:
+        """Nothing is known: r~ = r."""
+        key, key_agent = jax.random.split(key)
+        zero, middle = jnp.zeros(()), jnp.asarray(self.observer.y_middle, float)
+        sample, agent = self.first(middle, middle), self.agent.init(key_agent)
+        return LiveState(
+            agent=agent,
+            replay=self.replay.init(),
+            base=AffineParams(jnp.ones(()), zero),
+            kept=jax.tree.map(jnp.zeros_like, self.agent.actor(agent)),
+            begun=jnp.zeros((), bool),
+            leads=jnp.zeros((), bool),
+            response=Response(jnp.zeros(self.observer.history), jnp.zeros(self.observer.history)),
+            sample=sample,
+            others=self.gathered(sample),
+            noise=zero,
+            key=key,
+            updates=jnp.zeros((), jnp.int32),
+            counts=jnp.zeros(len(WHYS), jnp.int32),
+        )
+
+    def trained(self, key: chex.PRNGKey, state: TrainState, actor: Any) -> LiveState:
+        """Begin with what a run has learned; its optimisers and targets begin anew."""
+        fresh = self.fresh(key)
+        if jax.tree.structure(state.agent) == jax.tree.structure(fresh.agent):
+            agent = self.agent.restarted(state.agent)
+        else:  # of a learner that can't go on here
+            agent = self.agent.with_actor(fresh.agent, actor)
+        kept = jax.tree.map(jnp.copy, self.agent.actor(agent))  # the agent is donated, and no buffer twice
+        return fresh._replace(agent=agent, kept=kept, base=state.base, begun=jnp.ones((), bool))
+
+    def stage(self, state: LiveState) -> Stage:
+        """What decides where nothing is wrong."""
+        return "learned" if state.leads else self.kept if state.begun else "recording"
+
+    @partial(jax.jit, static_argnums=0)
+    def first(self, r: jax.Array, y: jax.Array) -> Sample:
+        """What stands before the first sample: the loop at rest at y."""
+        r_tilde = jnp.clip(y, *self.observer.r_tilde_bounds)
+        return Sample(self.observer.init(r, y), r, y, r_tilde, jnp.full((), -1, jnp.int32))
+
+    @partial(jax.jit, static_argnums=0)
+    def gathered(self, sample: Sample) -> Others:
+        """The others, each where the loop is."""
+        n, history = COMPARED + EXPLORING, self.observer.history
+        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), sample)
+        samples = samples._replace(age=jnp.full_like(samples.age, -1))
+        return Others(samples, jnp.zeros((n, history)), jnp.zeros((n, history)), jnp.zeros(n))
+
+    @partial(jax.jit, static_argnums=0)
+    def act(
+        self, actors: tuple[Any, Any], base: AffineParams, before: Sample, explore: Any, r: jax.Array, y: jax.Array
+    ) -> tuple[Memory, jax.Array]:
+        """At t_k: the memory, and r~ of both actors, the kept and the learned one, with exploration; (2,)."""
+        memory = self.observer.record(before.memory, before.y, before.r_tilde)
+        memory, obs = self.observer.observe(memory, r, y)
+        actions = jnp.stack([self.policy.action(actor, obs) for actor in actors])
+        actions = jnp.clip(actions + explore, -1.0, 1.0)
+        return memory, jax.vmap(self.policy.r_tilde, (None, None, 0))(base, r, actions)
+
+    @partial(jax.jit, static_argnums=0)
+    def relive(
+        self, state: LiveState, actor: Any, now: Sample, step: jax.Array
+    ) -> tuple[Others, jax.Array, jax.Array, jax.Array]:
+        """What t_k is to the loop and to the others.
+
+        Args:
+            state: before t_k; its agent and replay are not looked at.
+            actor: of the others.
+            now: the sample of t_k.
+            step: k, uint32.
+
+        Returns:
+            The others; the loop's next exploration noise; rows (E, width) for the replay, of the step up to t_k; and y
+            (3,) of those that are compared. While the response is not known, each row is that of the loop.
+        """
+        key_noise, key_when, key_r = jax.random.split(jax.random.fold_in(state.key, step), 3)
+        (low, high), n = self.env.plant.setpoint_range, COMPARED + EXPLORING
+        others, before = state.others, state.others.sample
+        compared = jnp.arange(n) < COMPARED
+        other_r = jax.random.uniform(key_r, (n,), float, low, high)
+        redrawn = jax.random.uniform(key_when, (n,), float) < REDRAW
+        r = jnp.where(compared, now.r, jnp.where(redrawn, other_r, before.r))
+        y = now.y + others.dy[:, 0]
+
+        sigma = jnp.geomspace(*SIGMA, 1 + EXPLORING)
+        before_noise = jnp.append(state.noise, others.noise[COMPARED:])
+        normal = jax.random.normal(key_noise, before_noise.shape, before_noise.dtype)
+        explore = noise.ornstein_uhlenbeck(before_noise, normal, THETA, sigma)
+        other_noise = jnp.concatenate([jnp.zeros(COMPARED), explore[1:]])
+
+        actors = state.kept, actor
+        memory, r_tilde = jax.vmap(self.act, (None, None, 0, 0, 0, 0))(actors, state.base, before, other_noise, r, y)
+        passed = jnp.clip(now.r, *self.observer.r_tilde_bounds)
+        r_tilde = r_tilde[:, 1].at[:2].set(jnp.stack([passed, r_tilde[1, 0]]))
+        dr_tilde = jnp.column_stack([r_tilde - now.r_tilde, others.dr_tilde[:, :-1]])
+        dy = jnp.column_stack([others.dy @ state.response.a + dr_tilde @ state.response.b, others.dy[:, :-1]])
+        row = self.row(state.base, state.sample, now.r, now.y)
+        known = jnp.any(state.response.b != 0.0)
+        rows = jnp.where(known, jax.vmap(self.row, (None, 0, 0, 0))(state.base, before, r, y), row[None])
+        age = jnp.where(now.age == 0, 0, before.age + 1)
+        others = Others(Sample(memory, r, y, r_tilde, age), dy, dr_tilde, other_noise)
+        return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED]
+
+    def row(self, base: AffineParams, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
+        """The replay's row of the step from the sample before to r and y; (width,)."""
+        signals = Signals(
+            r=before.r,
+            y=before.y,
+            integral=before.memory.integral,
+            r_tilde=before.r_tilde,
+            age=before.age.astype(y.dtype),
+            r_next=r,
+            y_next=y,
+        )
+        earlier, price = before.memory.r_tilde_past[0], rewards.params(self.env.plant)
+        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier)
+        action, never = self._action(base, before.r, before.r_tilde), jnp.zeros_like(y)
+        return jnp.stack([*signals, action, self.reward_scale * reward, never, never])
+
+    def _action(self, base: AffineParams, r: jax.Array, r_tilde: jax.Array) -> jax.Array:
+        """The action of which r~ comes; beyond [-1, 1] where r passed through."""
+        low, high = self.observer.r_tilde_bounds
+        return (r_tilde - base.offset - base.slope * r) / ((high - low) / 2)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def write(self, replay: ReplayState, rows: jax.Array) -> ReplayState:
+        """The replay with one row more of each."""
+        return self.replay.write(replay, rows)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def relabelled(self, replay: ReplayState, base: AffineParams) -> ReplayState:
+        """The replay with its actions in terms of another base."""
+        rows, places = replay.rows, [FIELDS.index(name) for name in ("r", "r_tilde", "action")]
+        r, r_tilde = (rows[..., place].astype(base.slope.dtype) for place in places[:2])
+        action = self._action(base, r, r_tilde).astype(rows.dtype)
+        return replay._replace(rows=rows.at[..., places[2]].set(action))
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def update(self, agent: Any, replay: ReplayState, key: chex.PRNGKey, number: jax.Array) -> Any:
+        """Update number so and so, uint32, from the replay."""
+        key_batch, key_update = jax.random.split(jax.random.fold_in(key, number))
+        bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
+        transitions = batch(self.replay, self.observer, self.data.discount, replay, bits)
+        return self.agent.update(agent, transitions, key_update)[0]
+
+    def identify(self, replay: ReplayState) -> tuple[AffineParams, Response]:
+        """By a linear model of the last steps: the static inverse, r~ = (r - offset) / gain, and the response.
+
+        Raises:
+            ValueError: they do not tell it.
+        """
+        data = self._record(replay)
+        half, least = len(data.y) // 2, 4 * data.y.shape[1]
+        if half < least:
+            raise ValueError(f"{len(data.y)} steps without interruption are too few; it takes {2 * least}")
+        if np.ptp(data.r_tilde) == 0.0:
+            raise ValueError("r~ has not moved")
+        whole, *halves = (_model(Record(*(x[part] for x in data))) for part in (slice(None), *_halves(half)))
+        gains = [identify.gain(model) for model in (whole, *halves)]
+        if identify.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
+            told = ", ".join(f"{each:.3g}" for each in gains)
+            raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
+        dtype = jnp.result_type(float)
+        found = (1.0 / gains[0], -identify.offset(whole) / gains[0], whole.a, whole.b)
+        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
+        return AffineParams(slope, offset), Response(a, b)
+
+    def _record(self, replay: ReplayState) -> Record:
+        """Windows of H steps of the loop without interruption, each with the y after it."""
+        layout, written = self.replay, int(replay.written)
+        recent = np.arange(max(0, written - min(RECENT, layout.steps - layout.mirror)), written)
+        rows = np.asarray(replay.rows)[0, recent % layout.steps + layout.mirror].astype(np.float64)
+        field, n = dict(zip(FIELDS, rows.T, strict=True)), self.observer.history
+        ends = np.flatnonzero(field["age"][n - 1 :] >= n - 1) + n - 1
+        windows = ends[:, None] + np.arange(1 - n, 1)
+        return Record(field["r_tilde"][windows], np.column_stack([field["y"][windows], field["y_next"][ends]]))
+
+
+def _halves(half: int) -> tuple[slice, slice]:
+    return slice(half), slice(half, None)
+
+
+def _model(data: Record) -> Model:
+    found = identify.fit_arx(data, data.r_tilde.shape[1], 0)
+    return Model(found.a, found.b, found.c, found.sigma)
+
+
+def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[TrainConfig, Environment]:
+    """Learner and declaration of a loop of which nothing is known but its ranges.
+
+    Raises:
+        ValueError: the ranges are none.
+    """
+    said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
+    said |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # each move of r~ has its price
+    plant, _ = arx.make(FOLLOWS, [FOLLOWS], **said)
+    observer = Observer.of(plant)
+    return configured(NAME, "live", LIVE), Environment(plant, observer, SetPoint(*plant.setpoint_range))

@@ -1,0 +1,358 @@
+"""A real-time loop around a bare function `step(r_tilde) -> y`: clock, deadlines, and what stands against control."""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.runtime.controller import Transfer, Watch
+from jaxouter.runtime.online import WHYS, Live, LiveState, Sample, Stage, Why
+
+RESERVE = 0.1  # of a period, which updates leave alone
+FORGET = 0.9  # of what an update was last seen to take at most
+NAP = 0.2  # s, longest sleep before looking whether to stop
+LATELY = 200  # control steps, time constant of the mean errors that are compared
+CAME, KEPT, LEARNED = 0, 2, 3  # of the errors
+BETTER = 0.9  # errors as large as those of the policy that was kept let what was learned take over
+WORSE, SLACK = 1.25, 0.02  # as large, and so much of half the set-point range more: they send it back
+
+
+class StepError(Exception):
+    """The user's function failed, or gave no number."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How the loop runs."""
+
+    dt: float
+    """Period, s."""
+    learn: bool = False
+    record: int = 500
+    """Control steps before the response is identified, and the static inverse."""
+    most_updates: int = 8
+    """Updates a period, at most."""
+    transfer_steps: int = 10
+    """Control steps in which r~ goes from one stage to the next."""
+
+
+class Row(NamedTuple):
+    """A control step, as it came and as it was answered."""
+
+    step: int
+    time: float  # s, when it was due
+    r: float
+    y: float | None
+    r_tilde: float
+    why: Why
+    y_passed: float | None  # y, had r passed all the time, as far as the record tells
+    y_kept: float | None  # y, had the static inverse acted, or the trained policy as it was
+    y_learned: float | None  # y, had what is learned so far acted
+
+
+class Loop:
+    """A loop in time: `step` once a period, `learn` with what is left of it.
+
+    A deadline is missed where r~ is not chosen within the period. Then, and where y is no number or out of range, r
+    passes for that step; what was learned takes over with the next one. The grid of periods is kept: what came too late
+    for a whole period is skipped.
+
+    What was learned takes over where |r - y| would have been less than under the policy that was kept lately, as far as
+    the record tells that. Where it turns out worse, the one that was kept is back, for as many updates as in the
+    beginning.
+    """
+
+    def __init__(
+        self,
+        live: Live,
+        state: LiveState,
+        plant: Callable[[float], Any],
+        reference: Callable[[int], float],
+        settings: Timing,
+        begin: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Compiles all that it will call.
+
+        Args:
+            live, state: what acts and learns.
+            plant: applies r~, and gives y as it is then measured; None: it did not come.
+            reference: r of a control step.
+            settings: how it runs.
+            begin: time of the first row, s.
+            clock: s.
+
+        Raises:
+            ValueError: an update takes longer than a period.
+        """
+        self.live, self.settings = live, settings
+        self.act_seconds = array("f")
+        self.sent_back = 0  # times that what was learned turned out worse
+        self.trouble: str | None = None  # why there is no static inverse yet
+        self._state = state if settings.learn else state._replace(noise=jnp.zeros_like(state.noise))
+        self._plant, self._reference, self._clock = plant, reference, clock
+        self._counts = dict(zip(WHYS, np.asarray(state.counts).tolist(), strict=True))
+        self._float = np.dtype(jnp.result_type(float)).type
+        self._stage: Stage = live.stage(state)
+        self._r_tilde = self._clip(reference(self.steps))
+        self._watch = Watch(self._r_tilde, self._r_tilde, live.env.plant.divergence_bounds, settings.dt, math.inf, 1)
+        self._transfer = self._from_here()
+        self._met = self._unbroken = False  # whether there was a y yet; whether the step before may be learned from
+        self._written = int(state.replay.written)
+        self._updates = int(state.updates)
+        self._identify_at = settings.record
+        self._takeover_at = live.takeover
+        self._known = bool(np.any(state.response.b))
+        self._errors = np.zeros(4)  # lately, of what came and of the others that are compared
+        self._compile()
+        self._fastest = self._longest = self._update_takes() if settings.learn else 0.0
+        self._begin, self._period = begin, 0
+        self.start()
+
+    def start(self) -> None:
+        """The next step is due now."""
+        self._origin = self._clock() - self._period * self.settings.dt
+
+    @property
+    def steps(self) -> int:
+        """Control steps so far."""
+        return sum(self._counts.values())
+
+    @property
+    def counts(self) -> dict[Why, int]:
+        """Control steps by what decided them."""
+        return dict(self._counts)
+
+    @property
+    def updates(self) -> int:
+        """Updates so far."""
+        return self._updates
+
+    @property
+    def stage(self) -> Stage:
+        """What decides where nothing is wrong."""
+        return self._stage
+
+    @property
+    def state(self) -> LiveState:
+        """All that has changed."""
+        counts, updates = (jnp.asarray(x, jnp.int32) for x in (list(self._counts.values()), self._updates))
+        return self._state._replace(counts=counts, updates=updates)
+
+    @property
+    def left(self) -> float:
+        """Seconds until the next step is due; negative: it is."""
+        return self._origin + self._period * self.settings.dt - self._clock()
+
+    def step(self) -> Row:
+        """One control step, now.
+
+        Raises:
+            StepError: the plant failed.
+        """
+        dt, before = self.settings.dt, self._state.sample
+        skipped = max(0, math.floor(-self.left / dt))
+        self._period += skipped
+        due, k = self._period, self.steps
+        r = self._reference(k)
+        y = self._measured()
+        begun = self._clock()
+        fault: Why | None = self._watch.judge(r, y, None)
+        r_seen, y_seen = (self._float(value) for value in self._watch.within())
+        if not self._met:
+            before = self.live.first(r_seen, y_seen)
+            self._met = fault is None
+        actors = self._state.kept, self.live.agent.actor(self._state.agent)
+        memory, offered = self.live.act(actors, self._state.base, before, self._state.noise, r_seen, y_seen)
+        kept, learned = np.asarray(offered).tolist()
+        wanted = {"recording": r, self.live.kept: kept, "learned": learned}
+        self._period += 1
+        if self.left < 0.0 or (skipped and self._unbroken):
+            fault = "late"
+        elif fault is None and not math.isfinite(wanted[self._stage]):
+            fault = "not finite"
+        self._apply(r if fault else wanted[self._stage], fault is None)
+        self.act_seconds.append(self._clock() - begun)
+        why = fault or self._stage
+        self._counts[why] += 1
+        y_others = self._note(before, memory, r_seen, y_seen, fault is None)
+        return Row(k, round(self._begin + due * dt, 9), r, y, self._r_tilde, why, *y_others)
+
+    def learn(self) -> None:
+        """Identify or update, as long as there is time before the next step."""
+        if not self.settings.learn:
+            return
+        if not self._known and self._written >= self._identify_at:
+            self._identify()
+        enough = self._written >= self.live.data.batch_size and self._stage != "recording"
+        for _ in range(self.settings.most_updates if enough else 0):
+            begun = self._clock()
+            if self._longest > self.left - RESERVE * self.settings.dt:
+                self._longest = max(self._fastest, FORGET * self._longest)
+                break
+            number = np.uint32(self._updates)
+            agent = self.live.update(self._state.agent, self._state.replay, self._state.key, number)
+            self._state = self._state._replace(agent=jax.block_until_ready(agent))
+            self._updates += 1
+            self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
+        better = self._errors[LEARNED] < BETTER * self._errors[KEPT]
+        if self._stage == self.live.kept and self._updates >= self._takeover_at and better:
+            self._errors[CAME] = self._errors[KEPT]
+            self._enter("learned")
+
+    def _measured(self) -> float | None:
+        try:
+            y = self._plant(self._r_tilde)
+        except Exception as error:
+            raise StepError(f"it failed: {type(error).__name__}: {error}") from error
+        try:
+            return None if y is None else float(y)
+        except (TypeError, ValueError):
+            raise StepError(f"it gave {y!r}; it must give a number, or None where there is none") from None
+
+    def _apply(self, wanted: float, controls: bool) -> None:
+        """R passes at once, and control is back at once; between stages the difference fades out."""
+        if controls:
+            self._r_tilde = self._transfer.apply(wanted, True)
+        else:
+            self._r_tilde = self._transfer.r_tilde = self._clip(wanted)
+
+    def _clip(self, r_tilde: float) -> float:
+        low, high = self.live.observer.r_tilde_bounds
+        return min(max(r_tilde, low), high)
+
+    def _from_here(self) -> Transfer:
+        bounds, steps = self.live.observer.r_tilde_bounds, self.settings.transfer_steps
+        return Transfer(self._r_tilde, bounds, math.inf, steps, controls=False)
+
+    def _enter(self, stage: Stage) -> None:
+        self._stage, self._transfer = stage, self._from_here()
+        self._state = self._state._replace(leads=jax.device_put(np.bool_(stage == "learned")))
+
+    def _note(self, before: Sample, memory: Any, r: Any, y: Any, fine: bool) -> Sequence[float | None]:
+        """The step becomes past, and what came of the one before is kept; y of the others."""
+        state, follows = self._state._replace(sample=before), fine and self._unbroken
+        age: Any = np.int32(before.age + 1 if follows else 0)
+        now = Sample(memory, r, y, self._float(self._r_tilde), age)
+        self._unbroken = fine
+        if not (self.settings.learn or self._known):
+            self._state = state._replace(sample=now)
+            return [None] * 3
+        rest, actor = state._replace(agent=None, replay=None), self.live.agent.actor(state.agent)
+        others, noise, rows, y_others = self.live.relive(rest, actor, now, np.uint32(self.steps))
+        if self.settings.learn:
+            state = state._replace(noise=noise)
+        if self.settings.learn and follows:
+            state = state._replace(replay=self.live.write(state.replay, rows))
+            self._written += 1
+        self._state = state._replace(sample=now, others=others)
+        if not self._known:
+            return [None] * 3
+        found = np.asarray(y_others)
+        if follows:
+            self._compare(float(before.r), np.append(y, found))
+        return found.tolist()
+
+    def _compare(self, r: float, y: np.ndarray) -> None:
+        """Send what was learned back where it has been worse than what was kept."""
+        self._errors += (np.abs(r - y) - self._errors) / LATELY
+        bound = WORSE * self._errors[KEPT] + SLACK * self.live.observer.y_scale
+        if self._stage == "learned" and self._errors[CAME] > bound:
+            self.sent_back += 1
+            self._takeover_at = self._updates + self.live.takeover
+            self._enter(self.live.kept)
+
+    def _identify(self) -> None:
+        """The response, and where r has passed so far the static inverse."""
+        try:
+            base, response = self.live.identify(self._state.replay)
+        except ValueError as error:
+            self.trouble, self._identify_at = str(error), self._written + self.settings.record
+            return
+        others = self.live.gathered(self._state.sample)
+        self._state, self._known = self._state._replace(response=response, others=others), True
+        self.trouble = None
+        if self._stage == "recording":
+            replay = self.live.relabelled(self._state.replay, base)
+            self._state = self._state._replace(replay=replay, base=base, begun=jax.device_put(np.True_))
+            self._enter(self.live.kept)
+
+    def _compile(self) -> None:
+        """On copies: what learns gives its buffers away."""
+        live, state = self.live, self._state
+        r = y = self._float(live.observer.y_middle)
+        sample = live.first(r, y)
+        actor = live.agent.actor(state.agent)
+        live.act((state.kept, actor), state.base, sample, state.noise, r, y)
+        rest = state._replace(agent=None, replay=None)
+        rows = live.relive(rest, actor, sample, np.uint32(0))[2]
+        live.gathered(sample)
+        if self.settings.learn:
+            live.relabelled(live.write(jax.tree.map(jnp.copy, state.replay), rows), state.base)
+
+    def _update_takes(self) -> float:
+        """The least of some, s."""
+        agent, took = jax.tree.map(jnp.copy, self._state.agent), []
+        for _ in range(10):
+            begun = self._clock()
+            agent = self.live.update(agent, self._state.replay, self._state.key, np.uint32(0))
+            jax.block_until_ready(agent)
+            took.append(self._clock() - begun)
+        if min(took) > (1.0 - RESERVE) * self.settings.dt:
+            raise ValueError(
+                f"the period is {self.settings.dt:g} s; an update takes {min(took):.2g} s here, and must fit into "
+                f"{1.0 - RESERVE:.0%} of a period for --learn"
+            )
+        return min(took)
+
+
+def run(
+    loop: Loop,
+    steps: int | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    report: Callable[[Row], None] = lambda row: None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
+    """Go on for so many control steps, or until it is to stop.
+
+    Args:
+        loop: what runs.
+        steps: None: no end.
+        stop: asked before each step, and while it waits.
+        report: called with each row, after r~ was chosen.
+        sleep: s.
+
+    Raises:
+        StepError: the plant failed.
+    """
+    end = math.inf if steps is None else loop.steps + steps
+    with _no_garbage():
+        loop.start()
+        while loop.steps < end:
+            while not stop() and (left := loop.left) > 0.0:
+                sleep(min(left, NAP))
+            if stop():
+                return
+            report(loop.step())
+            loop.learn()
+
+
+@contextmanager
+def _no_garbage() -> Iterator[None]:
+    """What there is already is not searched for garbage: that takes longer than a period."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

@@ -1,0 +1,44 @@
+"""Tasks: what is declared of each plant. A new one is one file, and one line in `TASKS`; or a file of one's own."""
+
+from __future__ import annotations
+
+import inspect
+
+from jaxouter import plants
+from jaxouter.tasks.heaters import HEATERS
+from jaxouter.tasks.pitch import PITCH
+from jaxouter.tasks.presets import PRESETS
+from jaxouter.tasks.task import Axis, Families, Options, Scenario, Sweep, Task
+
+__all__ = ["TASKS", "Axis", "Families", "Scenario", "Sweep", "Task", "of", "options", "presets"]
+
+TASKS: dict[str, Task] = {"pitch": PITCH, "heaters": HEATERS}
+
+
+def of(plant: str) -> Task:
+    """The task of a plant: that which is declared, or a bare one around its maker.
+
+    Raises:
+        ValueError: there is no such plant; lists those that exist.
+    """
+    maker = plants.resolve(plant)
+    if plant in TASKS:
+        return TASKS[plant]
+    declared = inspect.unwrap(maker)
+    return declared if isinstance(declared, Task) else Task(maker)
+
+
+def presets(plant: str) -> list[str]:
+    """Names of a plant's presets."""
+    return list(dict.fromkeys([*of(plant).presets, *PRESETS]))
+
+
+def options(plant: str, preset: str) -> Options:
+    """The options of a preset.
+
+    Raises:
+        ValueError: unknown plant or preset; lists those that exist.
+    """
+    if preset not in presets(plant):
+        raise ValueError(f"there is no preset {preset!r} for {plant}; the presets are: {', '.join(presets(plant))}")
+    return {**PRESETS.get(preset, PRESETS["default"]), **of(plant).presets.get(preset, {})}

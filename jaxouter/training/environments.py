@@ -1,0 +1,171 @@
+"""Environments side by side, in which an agent explores, and all that a training changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.agents import Agent
+from jaxouter.loop.environment import Environment, EnvParams, EnvState
+from jaxouter.loop.observation import Signals
+from jaxouter.loop.policy import AffineParams
+from jaxouter.training.policy import LearnedParams, LearnedPolicy
+
+AXIS = "environments"  # over the shards of a learner
+EPISODES = 16  # of a diagnosis
+
+
+class TrainState(NamedTuple):
+    """All training state of one seed."""
+
+    agent: Any
+    data: Any  # of the driver: the replay, or nothing
+    env: EnvState  # (E, ...)
+    obs: jax.Array  # (E, n)
+    noise: Any  # (E, ...), what exploration remembers
+    base: AffineParams  # base law of the policy
+    key: chex.PRNGKey
+    steps: jax.Array  # int32, environment steps so far
+
+
+class Step(NamedTuple):
+    """One step of every environment, (E, ...)."""
+
+    signals: Signals
+    action: jax.Array  # (E,)
+    reward: jax.Array  # (E,), in the learner's scale
+    terminated: jax.Array  # (E,), bool
+    truncated: jax.Array  # (E,), bool
+    plant_reward: jax.Array  # (E,), as the plant gives it
+    final_obs: jax.Array  # (E, n), before any reset
+
+
+@dataclass(frozen=True)
+class Environments:
+    """The environments of one training run, or of one of the shards into which they are split. Static and hashable.
+
+    Shards run as members of the mapped axis `AXIS`; agent, key and counters are the same in all.
+    """
+
+    env: Environment
+    policy: LearnedPolicy
+    agent: Agent
+    count: int
+    """Of this shard."""
+    steps: int
+    """Of the whole training, all environments together."""
+    reward_scale: float
+    """From the plant's reward to the learner's, whatever the unit of y."""
+    shards: int = 1
+
+    @property
+    def total(self) -> int:
+        """Environments of all shards."""
+        return self.count * self.shards
+
+    def fresh(self, key: chex.PRNGKey, params: EnvParams, data: Any) -> TrainState:
+        """Random networks, reset environments; a zero action is the middle of the range of r~."""
+        key, key_agent, key_env = jax.random.split(key, 3)
+        low, high = self.env.plant.r_tilde_bounds
+        obs, env = jax.vmap(self.env.reset, (0, None))(jax.random.split(key_env, self.count), params)
+        return TrainState(
+            agent=self.agent.init(key_agent),
+            data=data,
+            env=env,
+            obs=obs,
+            noise=self.agent.noise(self.count),
+            base=AffineParams(jnp.zeros(()), jnp.asarray((low + high) / 2, float)),
+            key=key,
+            steps=jnp.zeros((), jnp.int32),
+        )
+
+    def policy_params(self, state: TrainState) -> LearnedParams:
+        """What the policy has learned so far."""
+        return LearnedParams(self.agent.actor(state.agent), state.base)
+
+    def keys(self, state: TrainState, steps: int, n: int) -> list[chex.PRNGKey]:
+        """N keys for each of the next `steps` steps of all environments, (steps,) each, of this shard alone.
+
+        They depend on the number of the step, not on where an epoch began. Numbers are drawn from them for all steps
+        at once, before the loop: within it each draw would cost as much as a small matrix product.
+        """
+        numbers = state.steps + self.total * jnp.arange(steps, dtype=state.steps.dtype)
+        key = state.key if self.shards == 1 else jax.random.fold_in(state.key, jax.lax.axis_index(AXIS))
+        return list(jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), n), out_axes=1)(numbers))
+
+    def each(self, keys: chex.PRNGKey) -> chex.PRNGKey:
+        """A key for each environment: keys (steps,) -> (steps, E)."""
+        return jax.vmap(lambda key: jax.random.split(key, self.count))(keys)
+
+    def normals(self, keys: chex.PRNGKey) -> jax.Array:
+        """Standard normal numbers for exploration: keys (steps,) -> (steps, E)."""
+        return jax.vmap(lambda key: jax.random.normal(key, (self.count,), float))(keys)
+
+    def explore(self, state: TrainState, normal: jax.Array) -> tuple[jax.Array, Any, Any, jax.Array]:
+        """The agent's action in every environment.
+
+        An action that is not finite becomes zero: one of the three treatments of NaN (the environment passes r, a
+        roll-out has diverged), and the one that keeps a broken actor out of the data.
+
+        Returns:
+            actions (E,), the next noise, extras, and which actions were finite (E,).
+        """
+        progress = state.steps.astype(float) / self.steps
+        first = state.env.k == 0
+        explore = jax.vmap(self.agent.explore, (None, 0, 0, 0, 0, None))
+        action, noise, extras = explore(state.agent, state.noise, state.obs, normal[:, None], first, progress)
+        finite = jnp.isfinite(action[:, 0])
+        return jnp.where(finite, action[:, 0], 0.0), noise, extras, finite
+
+    def step(
+        self, state: TrainState, params: EnvParams, action: jax.Array, keys: chex.PRNGKey
+    ) -> tuple[TrainState, Step]:
+        """Every environment takes one step with its action (E,) and key (E,)."""
+        before = state.env
+        r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.base, before.r, action)
+        obs, env, reward, terminated, truncated, info = jax.vmap(self.env.step, (0, 0, 0, None))(
+            keys, before, r_tilde, params
+        )
+        signals = Signals(
+            r=before.r,
+            y=before.y_seen,
+            integral=before.memory.integral,
+            r_tilde=r_tilde,
+            age=before.k.astype(reward.dtype),
+            r_next=info["r"],
+            y_next=info["y"],
+        )
+        state = state._replace(env=env, obs=obs, steps=state.steps + self.total)
+        scaled = reward * self.reward_scale
+        return state, Step(signals, action, scaled, terminated, truncated, reward, info["final_observation"])
+
+    def expectations(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
+        """What the agent expects of fresh training episodes, and what comes.
+
+        Returns:
+            q_start, return_start: means over episodes, discounted and in the learner's scale, without exploration and
+            bootstrapped where time is up.
+        """
+        expected, came = jax.vmap(self._episode, (0, None, None))(jax.random.split(key, EPISODES), state, params)
+        return {"q_start": jnp.mean(expected), "return_start": jnp.mean(came)}
+
+    def _episode(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+        """Value that the agent gives to an episode's start, and the discounted return."""
+        gamma, learned = self.agent.data.discount, self.policy_params(state)
+
+        def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
+            obs, env, weight = carry
+            r_tilde = self.policy.r_tilde(state.base, env.r, self.policy.action(learned.actor, obs))
+            obs, env, reward, terminated, _, _ = self.env.step_env(key, env, r_tilde, params)
+            return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
+
+        key_reset, key_run = jax.random.split(key)
+        obs, env = self.env.reset(key_reset, params)
+        keys = jax.random.split(key_run, self.env.plant.episode_steps)
+        (last, _, weight), rewards = jax.lax.scan(step, (obs, env, jnp.ones_like(env.y)), keys)
+        came = self.reward_scale * jnp.sum(rewards) + weight * self.agent.value(state.agent, last)
+        return self.agent.value(state.agent, obs), came

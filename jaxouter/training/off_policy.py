@@ -1,0 +1,164 @@
+"""The driver of off-policy learners: prefill, then epochs in which environments roll out and the learner updates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.agents.agent import OffPolicy, OffPolicyAgent, Transitions
+from jaxouter.agents.replay import Replay, ReplayState
+from jaxouter.agents.returns import n_step_return
+from jaxouter.loop.environment import EnvParams
+from jaxouter.loop.observation import Observer, Signals
+from jaxouter.training.environments import AXIS, Environments, Step, TrainState
+
+FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
+HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
+
+
+@dataclass(frozen=True)
+class OffPolicyDriver:
+    """The pure functions of a training from a replay, or of one of its shards. Static and hashable."""
+
+    environments: Environments
+    agent: OffPolicyAgent
+    data: OffPolicy  # the batch size is that of a shard
+    replay: Replay  # of a shard
+
+    def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
+        """State before the prefill, with an empty replay."""
+        return self.environments.fresh(key, params, self.replay.init())
+
+    @staticmethod
+    def layout(seed: Any, environment: Any) -> ReplayState:
+        """What of the replay lies on the axis of seeds alone, and what on that of environments too."""
+        return ReplayState(rows=environment, written=seed)
+
+    @staticmethod
+    def row(step: Step) -> jax.Array:
+        """Rows (E, width) of the replay."""
+        flags = [flag.astype(step.reward.dtype) for flag in (step.terminated, step.truncated)]
+        return jnp.stack([*step.signals, step.action, step.reward, *flags], -1)
+
+    def batch_of(self, state: TrainState) -> Transitions:
+        """Shapes of the batch of an update."""
+        bits = jax.ShapeDtypeStruct((self.data.batch_size, 2), jnp.uint32)
+        return jax.eval_shape(self.batch, state.data, bits)
+
+    def batch(self, replay: ReplayState, bits: jax.Array) -> Transitions:
+        """A batch of transitions, built from windows of signals, drawn by random bits (B, 2), uint32."""
+        return batch(self.replay, self.environments.env.observer, self.data.discount, replay, bits)
+
+    def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
+        """Random actions, each held for ten steps on average, until the replay holds as many steps as it is to."""
+        every = self.environments
+        steps = self.data.prefill // every.total
+        keys_redraw, keys_action, keys_env = every.keys(state, steps, 3)
+        redraw = jax.vmap(lambda key: jax.random.uniform(key, (every.count,), float) < HOLD)(keys_redraw)
+        fresh = jax.vmap(lambda key: jax.random.uniform(key, (every.count,), float, -1.0, 1.0))(keys_action)
+        held = jax.lax.cummax(jnp.where(redraw, jnp.arange(steps)[:, None], 0))  # the step of the last redraw
+        actions = jnp.take_along_axis(fresh, held, 0)
+
+        def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, None]:
+            state, taken = every.step(state, params, *xs)
+            return state._replace(data=self.replay.write(state.data, self.row(taken))), None
+
+        return jax.lax.scan(step, state, (actions, every.each(keys_env)))[0]
+
+    def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
+        """`steps` environment steps (over all environments of all shards) of exploration and learning.
+
+        The updates of a step draw from the rows of all steps up to the last but one before it. The replay must hold
+        more than one step.
+
+        Returns:
+            The state, and means over the epoch: the agent's metrics, `reward` (a step, with exploration), `diverged`
+            (share of the steps that ended an episode so) and `no_action` (share of actions that were not finite and
+            became zero).
+        """
+        every, data = self.environments, self.data
+        keys_noise, keys_env, keys_batch, keys_update = every.keys(state, steps // every.total, 4)
+        shape = (data.updates, data.batch_size, 2)
+        bits = jax.vmap(lambda key: jax.random.bits(key, shape, jnp.uint32))(keys_batch)
+        gathered = jax.vmap(self.batch, (None, 0))
+        xs = (
+            every.normals(keys_noise),
+            every.each(keys_env),
+            jnp.roll(bits, -1, 0),  # of the next step
+            jax.vmap(lambda key: jax.random.split(key, data.updates))(keys_update),
+        )
+
+        # The rows of a step are written, and its successor's batches gathered, as the next one begins: so environments,
+        # updates and batches need nothing of each other within a step, and are made at the same time.
+        def step(carry: tuple[TrainState, jax.Array, Transitions], xs: Any) -> tuple[Any, dict[str, jax.Array]]:
+            state, rows, batches = carry
+            normal, keys_env, bits, keys_update = xs
+            learned, replay = state.agent, self.replay.write(state.data, rows)
+            action, noise, _, finite = every.explore(state, normal)
+            state, taken = every.step(state, params, action, keys_env)
+
+            def update(learned: Any, xs: tuple[Transitions, chex.PRNGKey]) -> tuple[Any, Any]:
+                return self.agent.update(learned, *xs)
+
+            learned, metrics = jax.lax.scan(update, learned, (batches, keys_update))
+            state = state._replace(agent=learned, data=replay, noise=noise)
+            metrics = {**jax.tree.map(jnp.mean, metrics), **step_metrics(taken, finite)}
+            return (state, self.row(taken), gathered(replay, bits)), metrics
+
+        replay, rows = self.replay.take_back(state.data)
+        carry = state._replace(data=replay), rows, gathered(replay, bits[0])
+        (state, rows, _), metrics = jax.lax.scan(step, carry, xs)
+        state = state._replace(data=self.replay.write(state.data, rows))
+        metrics = jax.tree.map(jnp.mean, metrics)
+        return state, metrics if every.shards == 1 else jax.lax.pmean(metrics, AXIS)
+
+    def diagnose(self, state: TrainState, params: EnvParams, key: chex.PRNGKey) -> dict[str, jax.Array]:
+        """What tells whether the learning is sound; of the state of all shards, which stays as it is.
+
+        Returns:
+            What the agent tells of one batch; replay_age: mean age of what is drawn, in environment steps; and
+            `Environments.expectations`.
+        """
+        key_batch, key_update, key_run = jax.random.split(key, 3)
+        bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
+        found = self.agent.diagnose(state.agent, self.batch(state.data, bits), key_update)
+        expected = self.environments.expectations(key_run, state, params)
+        rows = jnp.minimum(state.data.written, self.replay.steps).astype(expected["q_start"].dtype)
+        return found | {"replay_age": self.environments.count * (rows - 1.0) / 2.0} | expected
+
+
+def step_metrics(taken: Step, finite: jax.Array) -> dict[str, jax.Array]:
+    """Means over environments of reward, divergence and actions that were not finite (E,)."""
+    return {
+        "reward": jnp.mean(taken.plant_reward),
+        "diverged": jnp.mean(jnp.where(taken.terminated, 1.0, 0.0)),
+        "no_action": jnp.mean(jnp.where(finite, 0.0, 1.0)),
+    }
+
+
+def batch(layout: Replay, observer: Observer, discount: float, replay: ReplayState, bits: jax.Array) -> Transitions:
+    """Transitions built from windows of signals.
+
+    Args:
+        layout, replay: the replay.
+        observer: of the observations.
+        discount: of the n-step returns.
+        bits: random, (B, 2), uint32.
+    """
+    windows, _ = layout.sample(replay, bits)
+
+    def transition(rows: jax.Array) -> Transitions:
+        field = dict(zip(FIELDS, rows.T, strict=True))
+        signals = Signals(*(field[name] for name in Signals._fields))
+        first = layout.lead
+        reward, bootstrap, used = n_step_return(
+            field["reward"][first:], field["terminated"][first:] > 0, field["truncated"][first:] > 0, discount
+        )
+        obs, next_obs = observer.before_and_after(signals, first, first + used)
+        return Transitions(obs, field["action"][first][None], reward, bootstrap, next_obs)
+
+    return jax.vmap(transition)(windows)

@@ -1,0 +1,105 @@
+"""The driver of on-policy learners: unroll the present policy, update from what it did, throw that away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxouter.agents.agent import Agent, Experience, OnPolicy
+from jaxouter.agents.returns import generalised_advantage
+from jaxouter.loop.environment import EnvParams
+from jaxouter.training.environments import AXIS, Environments, TrainState
+from jaxouter.training.off_policy import step_metrics
+
+
+@dataclass(frozen=True)
+class OnPolicyDriver:
+    """The pure functions of such a training, or of one of its shards. Static and hashable."""
+
+    environments: Environments
+    agent: Agent
+    data: OnPolicy
+
+    def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
+        """State before the first epoch."""
+        return self.environments.fresh(key, params, ())
+
+    @staticmethod
+    def layout(seed: Any, environment: Any) -> tuple[()]:
+        """There is no data between epochs."""
+        del seed, environment
+        return ()
+
+    def batch_of(self, state: TrainState) -> Experience:
+        """Shapes of the batch of an update."""
+        every, size = self.environments, self.data.unroll * self.environments.count // self.data.minibatches
+        normal = jax.ShapeDtypeStruct((every.count,), state.obs.dtype)
+        _, _, extras, _ = jax.eval_shape(every.explore, state, normal)
+
+        def of(leaf: Any) -> Any:
+            return jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype)
+
+        scalar, action = of(normal), cast(Any, jax.ShapeDtypeStruct((size, 1), normal.dtype))
+        return Experience(of(state.obs), action, jax.tree.map(of, extras), scalar, scalar)
+
+    def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
+        """Nothing: such a learner learns from its own actions alone."""
+        del params
+        return state
+
+    def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
+        """`steps` environment steps (over all environments of all shards), a multiple of an unroll of all of them.
+
+        Returns:
+            The state, and means over the epoch as of `OffPolicyDriver.epoch`.
+        """
+
+        def iteration(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            return self._iteration(state, params)
+
+        state, metrics = jax.lax.scan(iteration, state, None, steps // (self.data.unroll * self.environments.total))
+        metrics = jax.tree.map(jnp.mean, metrics)
+        return state, metrics if self.environments.shards == 1 else jax.lax.pmean(metrics, AXIS)
+
+    def _iteration(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One unroll, and the updates from it."""
+        every, data = self.environments, self.data
+        keys_noise, keys_env, keys_update = every.keys(state, data.unroll, 3)
+
+        def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, Any]:
+            obs = state.obs
+            action, noise, extras, finite = every.explore(state, xs[0])
+            state, taken = every.step(state, params, action, xs[1])
+            return state._replace(noise=noise), (obs, extras, taken, step_metrics(taken, finite))
+
+        state, (obs, extras, taken, metrics) = jax.lax.scan(
+            step, state, (every.normals(keys_noise), every.each(keys_env))
+        )
+        value, next_value = (self.agent.value(state.agent, each) for each in (obs, taken.final_obs))
+        advantage = jax.vmap(partial(generalised_advantage, discount=data.discount, gae_lambda=data.gae_lambda), 1, 1)(
+            taken.reward, value, next_value, taken.terminated, taken.terminated | taken.truncated
+        )
+        experience = Experience(obs, taken.action[..., None], extras, advantage, advantage + value)
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), experience)
+        size = data.unroll * every.count
+
+        def update(learned: Any, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[Any, dict[str, jax.Array]]:
+            rows, key = xs
+            return self.agent.update(learned, jax.tree.map(lambda leaf: leaf[rows], flat), key)
+
+        def one_pass(learned: Any, key: chex.PRNGKey) -> tuple[Any, dict[str, jax.Array]]:
+            key_order, key_update = jax.random.split(key)
+            order = jax.random.permutation(key_order, size).reshape(data.minibatches, -1)
+            return jax.lax.scan(update, learned, (order, jax.random.split(key_update, data.minibatches)))
+
+        learned, of_updates = jax.lax.scan(one_pass, state.agent, jax.random.split(keys_update[0], data.epochs))
+        return state._replace(agent=learned), jax.tree.map(jnp.mean, {**of_updates, **metrics})
+
+    def diagnose(self, state: TrainState, params: EnvParams, key: chex.PRNGKey) -> dict[str, jax.Array]:
+        """`Environments.expectations`; of the state of all shards, which stays as it is."""
+        return self.environments.expectations(key, state, params)

@@ -1,0 +1,125 @@
+"""The oracle on the lag, in small."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxouter import plants
+from jaxouter.evaluation.baselines import mpc, oracle, pi
+from jaxouter.evaluation.baselines.tuning import score, training_episodes
+from jaxouter.identification import identify
+from jaxouter.training.config import PretrainingConfig, preset
+from jaxouter.training.policy import LearnedParams
+from jaxouter.training.pretraining import Whitening, folded
+from jaxouter.training.trainer import build
+from tests import lag
+from tests.training.small import small as small_run
+
+KEY = jax.random.key(0)
+SMALL = {"SEEDS": 1, "BATCH": 16, "FIRST_STAGE": 100, "STAGES": 2, "VALIDATION": 64}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """Fewer seeds, episodes and gradient steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(plants.REGISTRY, "lag", lag.make)
+        for name, value in SMALL.items():
+            patch.setattr(oracle, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    return oracle.tune(*lag.make(), KEY, 0, lambda text, share: None)
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    return oracle.differentiable(preset("lag"))[0]
+
+
+@pytest.fixture(scope="module")
+def base():
+    return identify.static(*lag.make(), KEY)[1]
+
+
+@pytest.fixture(scope="module")
+def white(rollout, base):
+    return rollout.whitening(base, lag.make()[1], KEY)
+
+
+@pytest.mark.slow
+def test_it_is_as_good_as_pi_and_mpc(tuned):
+    """Within 2 % in return, on training episodes that none of them has seen."""
+    plant, params = lag.make()
+    episodes = training_episodes(plant, params, jax.random.key(1))
+    reached = score(*oracle.build(plant, tuned), episodes)
+    pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text, share: None)
+    assert reached > 1.02 * score(*pi.build(plant, pi_tuned), episodes)
+    exact = mpc.innovations_form(identify.fit_arx(identify.record(plant, params, KEY, 4), 2, 2))
+    for move_weight in (1e-4, 1e-3, 1e-2):
+        controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0))
+        assert reached > 1.02 * score(controller, (), episodes)
+
+
+def test_steps_and_stages_are_counted(tuned):
+    assert tuned.settings["gradient_steps"] == 200
+    assert tuned.steps == (200 * 16 + identify.LEVELS) * 50
+    first, second = (max(values) for values in tuned.settings["returns"])
+    assert second > 1.1 * first  # returns are negative
+
+
+def test_built_policy_is_the_one_that_was_chosen(tuned, rollout):
+    """Its return on the validation episodes is the one written down."""
+    policy, params = oracle.build(lag.LAG, tuned)
+    assert policy == rollout.policy
+    key = jax.random.split(KEY, 5)[4]
+    one = jax.tree.map(lambda leaf: leaf[None], params.actor)
+    value = oracle.returns(rollout, one, params.base, lag.make()[1], key)
+    assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_made_once():
+    start = PretrainingConfig(gradient_steps=100, batch_size=16)
+    config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), residual=True, steps=0)
+    said = []
+    found = oracle.retrained(config, lambda text, share: said.append((text, share)))
+    assert said == [("50 of 100 gradient steps", 0.5), ("100 of 100 gradient steps", 1.0)]
+    trainer, params = build(config)
+    episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
+    alone = score(*identify.static(*lag.make(), KEY), episodes)
+    assert score(trainer.policy, oracle.learned(found), episodes) > 0.85 * alone  # both negative
+    again = oracle.retrained(config, lambda text, share: said.append((text, share)))
+    assert (again.seconds, len(said)) == (found.seconds, 2)
+
+
+def test_folded_acts_like_the_network_on_whitened_observations(rollout):
+    size, rng = rollout.policy.observer.size, np.random.default_rng(0)
+    white = Whitening(*(jnp.asarray(rng.normal(size=shape), float) for shape in ((size,), (size, size))))
+    actor = rollout.policy.init_actor(KEY)
+    actor["params"]["Dense_2"]["kernel"] = 30.0 * actor["params"]["Dense_2"]["kernel"]  # not too small to see
+    obs = jnp.asarray(rng.normal(size=(20, size)), float)
+    act = jax.vmap(rollout.policy.action, (None, 0))
+    found, expected = act(folded(actor, white), obs), act(actor, (obs - white.mean[None]) @ white.matrix)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert np.ptp(expected) > 0.1
+
+
+def test_whitened_observations_have_nearly_unit_covariance(rollout, base, white):
+    """On other episodes than those it was made from; directions that hardly vary are left small, not blown up."""
+    zero = jax.tree.map(jnp.zeros_like, rollout.policy.init_actor(KEY))
+
+    def observed(key):
+        _, seen = rollout.episode(rollout.policy, LearnedParams(zero, base), lag.make()[1], key)
+        return jax.vmap(lambda carry, r, y: rollout.policy.observer.observe(carry, r, y)[1])(*seen)
+
+    obs = jax.jit(jax.vmap(observed))(jax.random.split(KEY, oracle.BATCH)).reshape(-1, rollout.policy.observer.size)
+    whitened = np.asarray((obs - white.mean[None]) @ white.matrix, float)
+    np.testing.assert_allclose(whitened.mean(0), 0.0, atol=1e-2)
+    variances = np.linalg.eigvalsh(np.cov(whitened.T))
+    assert variances.max() == pytest.approx(1.0, abs=0.02)
+    assert np.count_nonzero(variances > 0.9) > rollout.policy.observer.size // 2
+    assert variances.min() >= 0.0
