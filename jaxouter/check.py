@@ -16,7 +16,7 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures
-from jaxouter.identification import identify, recorded_data, validation
+from jaxouter.identification import recorded_data, steady_state, validation
 from jaxouter.plants import Plant, interface, simulate
 from jaxouter.plants.registry import add
 from jaxouter.plants.simulators import PlantOptions
@@ -86,7 +86,7 @@ def log_report(plant: Plant, path: str) -> Callable[[Path], Path]:
 
 def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
     """How the plant responds to r~; returns what draws it."""
-    found = identify.dc_gain(plant, params, jax.random.key(0))
+    found = steady_state.dc_gain(plant, params, jax.random.key(0))
     moves, responses = step_responses(plant, params)
     choice = choose(preset(plant.name))
     lines = [
@@ -104,12 +104,12 @@ def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
     return lambda figure: figures.step_responses(figure, plant, moves, responses)
 
 
-def within_reach(plant: Plant, found: identify.DcGain) -> list[float]:
+def within_reach(plant: Plant, found: steady_state.DcGain) -> list[float]:
     """Least and greatest y that r~ holds, by the DC gain."""
     return sorted(float(found.offset + found.gain * end) for end in plant.r_tilde_bounds)
 
 
-def steady(plant: Plant, found: identify.DcGain) -> list[tuple[str, str]]:
+def steady(plant: Plant, found: steady_state.DcGain) -> list[tuple[str, str]]:
     """What y comes to, or does instead."""
     unit = plant.y_unit
     if found.unsettled is not None:

@@ -29,7 +29,7 @@ from jaxouter import agents, plants, tasks
 from jaxouter.evaluation import cache, scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
 from jaxouter.evaluation.metrics import significant
-from jaxouter.identification.identify import IdentificationWarning
+from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.plants.registry import FORMS, Registration, add, own_errors
 from jaxouter.progress import Progress
 from jaxouter.training.run import RunWarning, add_agent

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.plants import Plant
 from jaxouter.plants.heaters import Law
 from jaxouter.training.devices import Processes, connect, spread
@@ -60,7 +60,7 @@ def main() -> None:
     options = tyro.cli(Options)
     with cli.user_errors():
         connect(options.devices, Processes())
-        base = identify.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # from four houses
+        base = steady_state.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # from four houses
         plant, params = plants.make("heaters", n=options.houses, law=options.law)
         params = spread(params, options.houses, options.devices)
     r_tilde = jnp.clip(base.offset + base.slope * options.r, *plant.r_tilde_bounds)

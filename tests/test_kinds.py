@@ -12,8 +12,8 @@ import pytest
 
 from jaxouter import check, compare, plants, train
 from jaxouter.evaluation.baselines import BASELINES
-from jaxouter.identification import identify
-from jaxouter.identification.identify import IdentificationWarning
+from jaxouter.identification import steady_state
+from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.plants import registry
 from jaxouter.training.config import from_dict
 from tests import kinds
@@ -44,7 +44,7 @@ def test_dead_time_is_told_whatever_y_grows_to(plant, dead):
 
 def test_no_gain_is_shown_where_there_is_none():
     plant, _ = kinds.Integrating()
-    found = identify.DcGain(jnp.asarray(3.8), jnp.zeros(()), "kind: y keeps growing", 0.04, 0.5)
+    found = steady_state.DcGain(jnp.asarray(3.8), jnp.zeros(()), "kind: y keeps growing", 0.04, 0.5)
     (gain, none), (_, change) = check.steady(plant, found)
     assert (gain, none) == ("DC gain", "none, y keeps growing")
     assert change == "by 0.04 1 a control step for each 1 of r~ beyond 0.5"
@@ -89,7 +89,7 @@ def test_every_kind_goes_through_check_train_and_compare(name, tmp_path, monkeyp
     told = " ".join(capsys.readouterr().out.split())
     if name in GAINS:
         plant, params = getattr(kinds, name)()
-        assert float(identify.dc_gain(plant, params, kinds.key(0)).gain) == pytest.approx(GAINS[name], rel=0.01)
+        assert float(steady_state.dc_gain(plant, params, kinds.key(0)).gain) == pytest.approx(GAINS[name], rel=0.01)
         assert f"DC gain │ {GAINS[name]:.3g}, y" in told
     else:
         assert f"DC gain │ none, {REST[name]}" in told

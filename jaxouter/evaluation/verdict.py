@@ -13,9 +13,9 @@ import numpy as np
 
 from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
-from jaxouter.identification.identify import RUN_ONCE
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
+from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 ON_HOST = 4  # episodes of a plant that is simulated elsewhere, and may be slow

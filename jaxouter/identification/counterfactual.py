@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
-from jaxouter.identification.identify import Record
+from jaxouter.identification.records import Record
 from jaxouter.plants import Plant, simulate
 from jaxouter.plants.base import float_leaves, with_float_leaves
 

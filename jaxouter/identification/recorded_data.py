@@ -11,17 +11,9 @@ import numpy as np
 from scipy.signal import lfilter, lfiltic
 
 from jaxouter.identification import columns
-from jaxouter.identification.identify import (
-    Record,
-    as_model,
-    fit_arx,
-    gain,
-    history_for,
-    kind_of,
-    offset,
-    radius,
-    settling,
-)
+from jaxouter.identification.dynamics import history_for
+from jaxouter.identification.linear_models import as_model, fit_arx, gain, kind_of, offset, radius, settling
+from jaxouter.identification.records import Record
 from jaxouter.plants import Plant, arx
 from jaxouter.plants.arx import Model
 from jaxouter.plants.simulators import PlantOptions

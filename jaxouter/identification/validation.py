@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import signal
 
-from jaxouter.identification.identify import gain, settling, step_response
+from jaxouter.identification.linear_models import gain, settling, step_response
 from jaxouter.identification.recorded_data import Ensemble, Log, free_run, without_last_quarter
 from jaxouter.plants.arx import Model
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from jaxouter.plants import declaration
 
+RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
 MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
 
 

@@ -23,8 +23,8 @@ import numpy as np
 from jaxouter.agents import AgentConfig, OffPolicy, noise
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.replay import Replay, ReplayState
-from jaxouter.identification import identify
-from jaxouter.identification.identify import Record
+from jaxouter.identification import linear_models
+from jaxouter.identification.records import Record
 from jaxouter.loop import rewards
 from jaxouter.loop.environment import Environment
 from jaxouter.loop.observation import Memory, Observer, Signals
@@ -299,12 +299,12 @@ class Live:
         if np.ptp(data.r_tilde) == 0.0:
             raise ValueError("r~ has not moved")
         whole, *halves = (_model(Record(*(x[part] for x in data))) for part in (slice(None), *_halves(half)))
-        gains = [identify.gain(model) for model in (whole, *halves)]
-        if identify.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
+        gains = [linear_models.gain(model) for model in (whole, *halves)]
+        if linear_models.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
             told = ", ".join(f"{each:.3g}" for each in gains)
             raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
         dtype = jnp.result_type(float)
-        found = (1.0 / gains[0], -identify.offset(whole) / gains[0], whole.a, whole.b)
+        found = (1.0 / gains[0], -linear_models.offset(whole) / gains[0], whole.a, whole.b)
         slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
         return AffineParams(slope, offset), Response(a, b)
 
@@ -324,7 +324,7 @@ def _halves(half: int) -> tuple[slice, slice]:
 
 
 def _model(data: Record) -> Model:
-    found = identify.fit_arx(data, data.r_tilde.shape[1], 0)
+    found = linear_models.fit_arx(data, data.r_tilde.shape[1], 0)
     return Model(found.a, found.b, found.c, found.sigma)
 
 

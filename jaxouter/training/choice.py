@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxouter import plants, tasks
-from jaxouter.identification import identify
-from jaxouter.identification.identify import Dynamics
+from jaxouter.identification import dynamics, steady_state
+from jaxouter.identification.dynamics import Dynamics
 from jaxouter.loop.observation import HISTORY
 from jaxouter.plants import Plant
 from jaxouter.training.config import PretrainingConfig, TrainConfig
@@ -42,10 +42,10 @@ def choose(config: TrainConfig) -> Choice:
     if config.randomise:
         plant, params = plants.randomised(plant, params, config.randomise)
     key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
-    found, steps = identify.explore(plant, params, key)
+    found, steps = dynamics.explore(plant, params, key)
     if not any(one.shown for one in found):
         try:
-            identify.dc_gain(plant, params, key)
+            steady_state.dc_gain(plant, params, key)
         except ValueError as error:
             late = (
                 f"within an episode of {plant.episode_steps} control steps; r~ does nothing, or its dead time is longer"
@@ -65,7 +65,7 @@ def _of_models(params: Any) -> Dynamics:
 def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int) -> Choice:
     """The choice for these dynamics, of a plant or of several that are drawn, told by so many control steps."""
     dead, order = max(one.dead for one in found), max(one.order for one in found)
-    wanted = max(identify.history_for(one.order, one.dead, HISTORY) for one in found)
+    wanted = max(dynamics.history_for(one.order, one.dead, HISTORY) for one in found)
     given = plant.history if config.history is None else config.history
     history, warnings = wanted if given is None else given, []
     if history <= dead:

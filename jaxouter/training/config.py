@@ -12,7 +12,7 @@ import tyro
 
 from jaxouter import agents, plants, tasks
 from jaxouter.agents import AgentConfig
-from jaxouter.identification.identify import LEVELS
+from jaxouter.identification.steady_state import LEVELS
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 

@@ -20,8 +20,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxouter.identification.identify import RUN_ONCE
 from jaxouter.loop.environment import EnvParams
+from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.environments import AXIS, TrainState
 from jaxouter.training.trainer import Trainer, build

@@ -23,11 +23,12 @@ import optax
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from jaxouter.identification import counterfactual, identify
+from jaxouter.identification import counterfactual, records
 from jaxouter.loop import closed_loop, rewards
 from jaxouter.loop.policy import AffineParams, Policy
 from jaxouter.loop.references import redrawn
 from jaxouter.plants import Plant
+from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
@@ -134,7 +135,7 @@ class DifferentiableRollout:
         step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
         return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
 
-    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
+    @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def whitening(self, base: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
         """From the observations under an actor whose action is zero."""
         zero = jax.tree.map(jnp.zeros_like, self.policy.init_actor(key))
@@ -248,7 +249,7 @@ def pretrain(
     for i, key_plant in enumerate(jax.random.split(key_record, config.plants)):
         say("recording", i, config.plants)
         one = plant_params if plant.draw is None else plant.draw(jax.random.fold_in(key_plant, 1), plant_params)
-        data = identify.record(longer, one, key_plant, config.episodes // config.plants)
+        data = records.record(longer, one, key_plant, config.episodes // config.plants)
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
     return pretrain_on(

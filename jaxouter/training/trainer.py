@@ -17,11 +17,12 @@ import jax
 from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.replay import Replay
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
+from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.environments import AXIS, Environments, TrainState
 from jaxouter.training.off_policy import FIELDS, OffPolicyDriver
@@ -89,7 +90,7 @@ class Trainer:
         plant = self.env.plant
         if self.config.residual:
             say("recording", 0, 0)
-            state = state._replace(base=identify.static(plant, params.plant, key_base)[1])
+            state = state._replace(base=steady_state.static(plant, params.plant, key_base)[1])
         if self.config.pretraining.gradient_steps:
             key_start = jax.random.fold_in(key_base, PRETRAINING)
             cfg, learned = self.config.pretraining, self.policy_params(state)
@@ -104,7 +105,7 @@ class Trainer:
             state = with_actor(actor)
         return state
 
-    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
+    @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         return self.fresh(key, params)
 
@@ -122,7 +123,7 @@ class Trainer:
         """`steps` environment steps of exploration and learning, see the driver."""
         return self.driver.epoch(state, params, steps)
 
-    @partial(jax.jit, static_argnums=0, compiler_options=identify.RUN_ONCE)
+    @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
         """What tells whether the learning is sound, see the driver; the state stays as it is."""
         return self.driver.diagnose(state, params, jax.random.fold_in(state.key, DIAGNOSIS))

@@ -19,7 +19,7 @@ from jaxouter.evaluation.jobs import WITHIN, Done, Entrant, Job
 from jaxouter.evaluation.metrics import figures_of_merit
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.stability import analyse
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop.policy import none
 from jaxouter.plants import REGISTRY
 from jaxouter.training.run import Run, write_json
@@ -273,7 +273,7 @@ def assert_same_trees(a, b):
 
 def test_load_gives_a_rival_as_it_was_identified():
     policy, params = jobs.load(STATIC, "lag")
-    expected = identify.static(*lag.make(), jax.random.key(0))
+    expected = steady_state.static(*lag.make(), jax.random.key(0))
     assert policy == expected[0]
     assert_same_trees(params, expected[1])
     assert float(params.slope) == pytest.approx(2.0, abs=1e-3)  # of the lag, 1 / K
@@ -422,7 +422,7 @@ def test_identified_knows_its_baselines():
     with pytest.raises(ValueError, match="no plant 'boat'"):
         identified("static", "boat")
     assert identified("none", "lag").steps == 0
-    assert identified("static", "lag").steps == identify.LEVELS * lag.LAG.episode_steps
+    assert identified("static", "lag").steps == steady_state.LEVELS * lag.LAG.episode_steps
     for name, baseline in BASELINES.items():
         assert baseline.kind == ("limit" if name == "oracle" else "baseline")
 

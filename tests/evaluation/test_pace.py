@@ -13,7 +13,7 @@ from jaxouter.evaluation import pace, scenarios
 from jaxouter.evaluation.policies import baseline
 from jaxouter.evaluation.policies import evaluate as evaluated
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.identification import identify
+from jaxouter.identification import records, steady_state
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
 from jaxouter.training.run import Run
@@ -83,7 +83,7 @@ def test_episodes_go_in_groups_of_as_many_as_may_be_side_by_side(mine):
         whole = rollout(*none(plant), scenario)
     jax.tree.map(np.testing.assert_array_equal, grouped, whole)
     before = Lag.steps
-    assert identify.record(*mine, jax.random.key(0), 5).y.shape == (5, 21)
+    assert records.record(*mine, jax.random.key(0), 5).y.shape == (5, 21)
     assert (Lag.steps - before, Lag.made) == (100, 10)
 
 
@@ -91,7 +91,7 @@ def test_what_is_known_of_the_inner_loop_is_not_run_again(mine):
     alone = evaluated(baseline("none", "mine"), [scenarios.get("mine/steps", 4)])
     before = Lag.steps
     found = evaluated(baseline("static", "mine"), [scenarios.get("mine/steps", 4)], alone=alone)
-    assert Lag.steps - before <= 4 * 20 + identify.LEVELS * 20
+    assert Lag.steps - before <= 4 * 20 + steady_state.LEVELS * 20
     again = evaluated(baseline("static", "mine"), [scenarios.get("mine/steps", 4)])
     assert found["mine/steps"][1] == again["mine/steps"][1]
 

@@ -12,7 +12,7 @@ from jaxouter.evaluation import comparison_figures, report, scenarios, statistic
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.policies import Named, baseline, evaluate
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.plants import make
 from jaxouter.training.run import surroundings
 from tests.precision import makes_nan
@@ -30,7 +30,7 @@ class Written(NamedTuple):
 
 
 def policies() -> dict[str, Named]:
-    hostile = Named(HOSTILE, *identify.static(*make("pitch"), jax.random.key(1)))
+    hostile = Named(HOSTILE, *steady_state.static(*make("pitch"), jax.random.key(1)))
     return {"none": baseline("none", "pitch"), "static": baseline("static", "pitch"), HOSTILE: hostile}
 
 

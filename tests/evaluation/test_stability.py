@@ -14,7 +14,7 @@ import scipy.linalg
 
 from jaxouter.evaluation.baselines.pi import PI, PIParams
 from jaxouter.evaluation.stability import LocalStability, analyse, spectral_radius
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop.observation import Observer
 from jaxouter.loop.policy import AffineParams, Policy, none
 from jaxouter.plants import Plant, make
@@ -123,7 +123,7 @@ def test_length_of_the_lines_does_not_matter() -> None:
 
 def test_static_prefilter_leaves_the_spectrum_of_pitch() -> None:
     plant, params = make("pitch")
-    stabilities = analyse(*identify.static(plant, params, KEY), plant, params, [-10.0, 0.0, 14.66])
+    stabilities = analyse(*steady_state.static(plant, params, KEY), plant, params, [-10.0, 0.0, 14.66])
     exact = largest(exact_pitch(W_NOMINAL)[0])
     np.testing.assert_allclose([c.spectral_radius for c in stabilities], exact, atol=1e-5)
     np.testing.assert_allclose([c.y for c in stabilities], [-10.0, 0.0, 14.66], atol=0.05)
@@ -234,7 +234,7 @@ def test_learned_policy_returns_as_fast_as_certified() -> None:
 
 def test_static_prefilter_at_its_bound_says_so() -> None:
     plant, params = lag.make()
-    found = one(*identify.static(plant, params, KEY), plant, params, 3.0)
+    found = one(*steady_state.static(plant, params, KEY), plant, params, 3.0)
     assert found.r_tilde == 4.0
     assert found.y == pytest.approx(2.0, abs=1e-6)
     assert found.spectral_radius == pytest.approx(np.exp(-0.1 / 0.3), abs=1e-6)

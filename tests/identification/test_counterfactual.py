@@ -7,7 +7,7 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.identification import counterfactual
-from jaxouter.identification.identify import Record, record
+from jaxouter.identification.records import Record, record
 from jaxouter.loop.references import telegraph
 from jaxouter.plants import make, simulate
 from tests import lag

@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 from jaxouter import plants
-from jaxouter.identification import identify
+from jaxouter.identification import linear_models
 from jaxouter.identification import recorded_data as logs
 from jaxouter.identification.recorded_data import Log
 from jaxouter.loop import environment
@@ -126,20 +126,20 @@ def test_a_clean_log_gives_the_lag_exactly(clean: Log) -> None:
     models = logs.ensemble(clean)
     assert (models.order, models.dead) == (2, 2)
     for model in (models.nominal, *models.members):
-        assert identify.gain(model) == pytest.approx(0.5, abs=1e-5)
-        assert identify.offset(model) == pytest.approx(0.0, abs=1e-5)
-        np.testing.assert_allclose(identify.step_response(model, 40), step_of_lag(40), atol=1e-5)
-    assert identify.settling(models.nominal) == 12  # 0.25 s + 3 T = 1.15 s
+        assert linear_models.gain(model) == pytest.approx(0.5, abs=1e-5)
+        assert linear_models.offset(model) == pytest.approx(0.0, abs=1e-5)
+        np.testing.assert_allclose(linear_models.step_response(model, 40), step_of_lag(40), atol=1e-5)
+    assert linear_models.settling(models.nominal) == 12  # 0.25 s + 3 T = 1.15 s
 
 
 def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: Log) -> None:
     """The noise is 5 % of the standard deviation of y."""
     models = logs.ensemble(noisy)
-    gains = [identify.gain(model) for model in models.members]
-    assert identify.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
+    gains = [linear_models.gain(model) for model in models.members]
+    assert linear_models.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
     assert abs(models.dead - 2) <= 1
     assert 1e-4 < np.std(gains) < 0.01
-    np.testing.assert_allclose(identify.step_response(models.nominal, 40), step_of_lag(40), atol=0.03)
+    np.testing.assert_allclose(linear_models.step_response(models.nominal, 40), step_of_lag(40), atol=0.03)
     assert models.redrawn == 0
     again = logs.ensemble(noisy)
     jax.tree.map(np.testing.assert_array_equal, again, models)
@@ -149,11 +149,11 @@ def test_pitch_is_identified_from_its_log() -> None:
     plant, params = plants.make("pitch")
     log = recorded(plant, params, rows=2_000, redraw=0.03)
     models = logs.ensemble(log, members=2)
-    assert identify.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
+    assert linear_models.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
     assert models.dead == 5  # 0.5 s
     base = np.zeros(150)
     true = np.asarray(plants.simulate(plant, params, base + 1.0, KEY) - plants.simulate(plant, params, base, KEY))
-    np.testing.assert_allclose(identify.step_response(models.nominal, 151)[1:], true, atol=3e-3)
+    np.testing.assert_allclose(linear_models.step_response(models.nominal, 151)[1:], true, atol=3e-3)
 
 
 @pytest.mark.parametrize(("dead", "rows"), [(70, 600), (90, 1_200)])
@@ -161,7 +161,7 @@ def test_a_long_dead_time_is_found(dead: int, rows: int) -> None:
     log = recorded(*kinds.late(dead)(), rows=rows, noise=0.01)
     models = logs.ensemble(log, members=2)
     assert models.dead == dead
-    assert identify.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
+    assert linear_models.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
 
 
 def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_settle(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
-from jaxouter.identification.identify import EXPLORED, Dynamics
+from jaxouter.identification.dynamics import EXPLORED, Dynamics
 from jaxouter.plants import arx
 from jaxouter.plants.arx import Model
 from jaxouter.training.choice import choose, fitted

@@ -9,7 +9,7 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
-from jaxouter.identification import identify, recorded_data
+from jaxouter.identification import recorded_data, steady_state
 from jaxouter.loop.policy import none
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.trainer import build
@@ -36,4 +36,4 @@ def test_a_controller_from_a_log_is_better_on_the_true_plant(path: Path, monkeyp
     episodes = training_episodes(plant, of_plant, jax.random.key(1), 64)
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
     assert reached > 0.7 * score(*none(plant), episodes)  # both negative
-    assert reached > score(*identify.static(plant, of_plant, jax.random.key(0)), episodes)
+    assert reached > score(*steady_state.static(plant, of_plant, jax.random.key(0)), episodes)

@@ -9,7 +9,7 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
-from jaxouter.identification import counterfactual, identify
+from jaxouter.identification import counterfactual, records, steady_state
 from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.epochs import train
@@ -50,7 +50,7 @@ def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
-    assert reached > 0.95 * score(*identify.static(plant, of_plant, jax.random.key(0)), episodes)  # both negative
+    assert reached > 0.95 * score(*steady_state.static(plant, of_plant, jax.random.key(0)), episodes)  # both negative
     jax.tree.map(np.testing.assert_array_equal, state.agent.actor, state.agent.target_actor)
 
 
@@ -69,7 +69,7 @@ def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
     episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
     assert float(np.ptp(episodes.params.K)) > 0.3
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
-    alone = score(*identify.static(*lag.make(), jax.random.key(0)), episodes)
+    alone = score(*steady_state.static(*lag.make(), jax.random.key(0)), episodes)
     assert reached > 0.8 * alone  # both negative
 
 
@@ -83,13 +83,13 @@ def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config,
     )
     start = replace(START, gradient_steps=150, episode_steps=80, log_above=0.1)
     config = replace(config, pretraining=start)
-    assert config.identification_steps == 8 * 80 + identify.LEVELS * 50
+    assert config.identification_steps == 8 * 80 + steady_state.LEVELS * 50
     trainer, params = build(config)
     policy = trainer.policy_params(trainer.start(0, params))
     assert lengths == [50, 80, 80]
     plant, of_plant = lag.make()
     episodes = training_episodes(plant, of_plant, jax.random.key(1))
-    assert score(trainer.policy, policy, episodes) > 0.9 * score(*identify.static(plant, of_plant, KEY), episodes)
+    assert score(trainer.policy, policy, episodes) > 0.9 * score(*steady_state.static(plant, of_plant, KEY), episodes)
 
 
 def test_where_the_loop_collapses_training_goes_back_and_on_at_half_the_rate(config, monkeypatch):
@@ -109,8 +109,8 @@ def test_where_the_loop_collapses_training_goes_back_and_on_at_half_the_rate(con
 def test_costs_count_by_their_logarithm_where_asked(config):
     """The reward with which a step on one episode begins."""
     trainer, _ = build(config)
-    model = counterfactual.fit(identify.record(*lag.make(), KEY, 8), 4)
-    of_record, base = counterfactual.plant(trainer.env.plant, 4), identify.static(*lag.make(), KEY)[1]
+    model = counterfactual.fit(records.record(*lag.make(), KEY, 8), 4)
+    of_record, base = counterfactual.plant(trainer.env.plant, 4), steady_state.static(*lag.make(), KEY)[1]
     actors = jax.tree.map(lambda leaf: leaf[None], trainer.agent.init(KEY).actor)
     white = Whitening(np.zeros(trainer.env.observer.size), np.eye(trainer.env.observer.size))
 

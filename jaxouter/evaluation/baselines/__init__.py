@@ -20,7 +20,7 @@ from jaxouter.evaluation import cache
 from jaxouter.evaluation.baselines import deepc, inverse, mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop.policy import Affine, AffineParams, Policy
 from jaxouter.plants import Plant, make
 from jaxouter.plants.registry import attribute
@@ -44,14 +44,14 @@ def _none(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Rep
 
 
 def _static(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    identified = identify.dc_gain(plant, params, key)
-    _, found = identify.prefilter(plant, identified)
+    identified = steady_state.dc_gain(plant, params, key)
+    _, found = steady_state.prefilter(plant, identified)
     settings = {"slope": float(found.slope), "offset": float(found.offset), "unsettled": identified.unsettled}
-    return Tuned(settings, {}, identify.LEVELS * plant.episode_steps)
+    return Tuned(settings, {}, steady_state.LEVELS * plant.episode_steps)
 
 
 def _affine(plant: Plant, tuned: Tuned) -> tuple[Policy, Any]:
-    identify.warn_unsettled(tuned.settings.get("unsettled"))
+    steady_state.warn_unsettled(tuned.settings.get("unsettled"))
     slope, offset = (jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset"))
     return Affine(plant.r_tilde_bounds), AffineParams(slope, offset)
 

@@ -27,7 +27,9 @@ from jaxouter.evaluation.baselines.mpc import RECORD, horizons_for, late
 from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, score, training_episodes
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification.identify import HORIZON, LEVELS, Record, choose_arx, dc_gain, record
+from jaxouter.identification.linear_models import HORIZON, choose_arx
+from jaxouter.identification.records import Record, record
+from jaxouter.identification.steady_state import LEVELS, dc_gain
 from jaxouter.plants import Plant
 
 RANK = 1e-6  # singular values below this share of the largest count as zero

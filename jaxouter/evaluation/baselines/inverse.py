@@ -26,7 +26,7 @@ from jaxouter.agents.ddpg import descend
 from jaxouter.agents.networks import Actor
 from jaxouter.evaluation.baselines.tuning import Report, score, training_episodes
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification import identify
+from jaxouter.identification import dynamics, records
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.plants import Plant
 
@@ -100,11 +100,11 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """A network for each of some h, on a record as long as the budget allows; the one with the greatest return."""
     key_record, key_fit, key_episodes = jax.random.split(key, 3)
-    history, explored = identify.suitable_history(plant, params, key_record)
+    history, explored = dynamics.suitable_history(plant, params, key_record)
     episodes = training_episodes(plant, params, key_episodes)
     tried = sorted({round(h) for h in np.geomspace(1, plant.episode_steps / 4, CANDIDATES)})
     spent = explored + len(tried) * episodes.r.size
-    data = identify.record(plant, params, key_record, (budget - spent) // plant.episode_steps)
+    data = records.record(plant, params, key_record, (budget - spent) // plant.episode_steps)
     policy = Inverse(Observer.of(plant, history))
     best: tuple[float, int, Any] | None = None
     for i, h in enumerate(tried):

@@ -18,7 +18,8 @@ import scipy.linalg
 from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, score, training_episodes
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification.identify import ARX, HORIZON, choose_arx, record, within
+from jaxouter.identification.linear_models import ARX, HORIZON, choose_arx
+from jaxouter.identification.records import record, within
 from jaxouter.plants import Plant
 
 RECORD = 50  # episodes of the record

@@ -20,8 +20,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned, cached
-from jaxouter.identification import counterfactual, identify
-from jaxouter.identification.identify import LEVELS, static
+from jaxouter.identification import counterfactual, dynamics
+from jaxouter.identification.steady_state import LEVELS, static
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant, make
 from jaxouter.training.config import TrainConfig, preset, to_dict
@@ -95,7 +95,7 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
     del budget
-    history, _ = identify.suitable_history(plant, params, key)
+    history, _ = dynamics.suitable_history(plant, params, key)
     found = train(differentiable(replace(preset(plant.name), history=history))[0], params, key, report)
     return found._replace(settings=found.settings | {"history": history})
 

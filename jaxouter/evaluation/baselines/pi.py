@@ -13,8 +13,8 @@ import scipy.optimize
 
 from jaxouter.evaluation.baselines.tuning import Report, score, training_episodes
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification import identify
-from jaxouter.identification.identify import dc_gain, prefilter
+from jaxouter.identification import steady_state
+from jaxouter.identification.steady_state import dc_gain, prefilter
 from jaxouter.loop.policy import AffineParams
 from jaxouter.plants import Plant
 
@@ -70,7 +70,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
         per_gain = 1.0 / (identified.rate * plant.episode_steps)
     episodes = training_episodes(plant, params, key_episodes)
     policy, time = PI(plant.r_tilde_bounds, plant.control_step), plant.episode_steps * plant.control_step
-    spent, each = identify.LEVELS * plant.episode_steps, episodes.r.size
+    spent, each = steady_state.LEVELS * plant.episode_steps, episodes.r.size
     most = (budget - spent) // each
     best: list[tuple[float, PIParams]] = []
 

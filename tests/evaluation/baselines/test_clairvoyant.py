@@ -9,7 +9,7 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.baselines.clairvoyant import Replay, plan
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop.policy import none
 from tests import lag
 from tests.precision import FLOAT, makes_nan
@@ -56,7 +56,7 @@ def test_optimum_on_the_lag_is_dead_time_plus_saturated_rise(on_lag):
 def test_no_other_policy_is_below_it_on_any_episode(on_lag):
     scenario, plant = on_lag.scenario, on_lag.scenario.plant
     _, params = lag.make(K=K, T=T, d=DEAD_STEPS * lag.CONTROL_STEP)
-    for policy in (none(plant), identify.static(plant, params, jax.random.key(0))):
+    for policy in (none(plant), steady_state.static(plant, params, jax.random.key(0))):
         assert (mae(rollout(*policy, scenario)) >= on_lag.plan.mae - 1e-6).all()
     rng = np.random.default_rng(0)
     for spread in (0.1, 1.0, 8.0):

@@ -11,7 +11,8 @@ from jaxouter.evaluation.baselines.deepc import DeePCSettings
 from jaxouter.evaluation.baselines.qp import Solver, blocks, differences
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.identification.identify import Record, fit_arx, record
+from jaxouter.identification.linear_models import fit_arx
+from jaxouter.identification.records import Record, record
 from tests import lag
 
 KEY = jax.random.key(0)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxouter.evaluation.baselines import inverse
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
-from jaxouter.identification.identify import record
+from jaxouter.identification.records import record
 from jaxouter.loop.observation import Memory
 from jaxouter.loop.policy import none
 from tests import lag

@@ -11,7 +11,8 @@ from jaxouter.evaluation.baselines.mpc import MPCSettings, innovations_form
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import excess, rollout
-from jaxouter.identification.identify import ARX, choose_arx, record
+from jaxouter.identification.linear_models import ARX, choose_arx
+from jaxouter.identification.records import record
 from jaxouter.loop.policy import none
 from tests import kinds, lag
 

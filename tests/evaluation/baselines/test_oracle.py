@@ -8,7 +8,7 @@ import pytest
 from jaxouter import plants
 from jaxouter.evaluation.baselines import mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
-from jaxouter.identification import identify
+from jaxouter.identification import linear_models, records, steady_state
 from jaxouter.training.config import PretrainingConfig, preset
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import Whitening, folded
@@ -42,7 +42,7 @@ def rollout():
 
 @pytest.fixture(scope="module")
 def base():
-    return identify.static(*lag.make(), KEY)[1]
+    return steady_state.static(*lag.make(), KEY)[1]
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
     reached = score(*oracle.build(plant, tuned), episodes)
     pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text, share: None)
     assert reached > 1.02 * score(*pi.build(plant, pi_tuned), episodes)
-    exact = mpc.innovations_form(identify.fit_arx(identify.record(plant, params, KEY, 4), 2, 2))
+    exact = mpc.innovations_form(linear_models.fit_arx(records.record(plant, params, KEY, 4), 2, 2))
     for move_weight in (1e-4, 1e-3, 1e-2):
         controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0))
         assert reached > 1.02 * score(controller, (), episodes)
@@ -66,7 +66,7 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
 
 def test_steps_and_stages_are_counted(tuned):
     assert tuned.settings["gradient_steps"] == 200
-    assert tuned.steps == (200 * 16 + identify.LEVELS) * 50
+    assert tuned.steps == (200 * 16 + steady_state.LEVELS) * 50
     first, second = (max(values) for values in tuned.settings["returns"])
     assert second > 1.1 * first  # returns are negative
 
@@ -90,7 +90,7 @@ def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_
     assert said == [("50 of 100 gradient steps", 0.5), ("100 of 100 gradient steps", 1.0)]
     trainer, params = build(config)
     episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
-    alone = score(*identify.static(*lag.make(), KEY), episodes)
+    alone = score(*steady_state.static(*lag.make(), KEY), episodes)
     assert score(trainer.policy, oracle.learned(found), episodes) > 0.85 * alone  # both negative
     again = oracle.retrained(config, lambda text, share: said.append((text, share)))
     assert (again.seconds, len(said)) == (found.seconds, 2)

@@ -13,7 +13,7 @@ from jaxouter.evaluation.baselines import pi
 from jaxouter.evaluation.baselines.pi import PI, PIParams
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.identification import identify
+from jaxouter.identification import steady_state
 from jaxouter.loop.policy import AffineParams, none
 from tests import kinds, lag
 from tests.precision import of_single_draws
@@ -78,7 +78,7 @@ def test_tuned_beats_the_static_prefilter_and_twice_the_budget_is_worth_little(t
     twice = pi.tune(plant, params, KEY, 2 * BUDGET, lambda text, share: None)
     episodes = training_episodes(plant, params, jax.random.split(KEY)[1])
     once = score(*pi.build(plant, tuned), episodes)
-    assert once > 0.92 * score(*identify.static(plant, params, KEY), episodes)
+    assert once > 0.92 * score(*steady_state.static(plant, params, KEY), episodes)
     assert score(*pi.build(plant, twice), episodes) == pytest.approx(once, rel=0.01)
     assert tuned.steps <= BUDGET
     assert twice.steps <= 2 * BUDGET
@@ -102,9 +102,9 @@ def test_where_y_does_not_settle_it_acts_from_where_y_stays(plant):
 
 def test_it_leaves_no_steady_state_error_where_the_static_prefilter_does(steps):
     plant, params = lag.make()
-    _, base = identify.static(plant, params, KEY)
+    _, base = steady_state.static(plant, params, KEY)
     integrating = PI(plant.r_tilde_bounds, plant.control_step), PIParams(base, number(0.5), number(2.0))
-    found, static = (rollout(*baseline, steps) for baseline in (integrating, identify.static(plant, params, KEY)))
+    found, static = (rollout(*baseline, steps) for baseline in (integrating, steady_state.static(plant, params, KEY)))
     np.testing.assert_allclose(found.y[:, -1], found.r[:, -1], atol=1e-3)
     np.testing.assert_allclose(static.y[:, -1], 1.1 * static.r[:, -1], atol=1e-4)
 

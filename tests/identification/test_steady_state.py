@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.identification import identify
-from jaxouter.identification.identify import ARX, Record
+from jaxouter.identification import linear_models, records, steady_state
+from jaxouter.identification.linear_models import ARX
+from jaxouter.identification.records import Record
 from jaxouter.plants import make
 from tests import lag
 
@@ -21,14 +22,14 @@ KEY = jax.random.key(0)
 
 
 def test_dc_gain_of_pitch_is_a_third_without_offset() -> None:
-    gain, offset, *_ = identify.dc_gain(*make("pitch"), KEY)
+    gain, offset, *_ = steady_state.dc_gain(*make("pitch"), KEY)
     assert float(gain) == pytest.approx(1 / 3, rel=0.01)
     assert float(offset) == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("K", [0.5, -2.0])
 def test_dc_gain_of_a_lag_is_exact(K: float) -> None:
-    gain, offset, *_ = identify.dc_gain(*lag.make(K=K, T=0.2), KEY)
+    gain, offset, *_ = steady_state.dc_gain(*lag.make(K=K, T=0.2), KEY)
     assert float(gain) == pytest.approx(K, rel=1e-5)
     assert float(offset) == pytest.approx(0.0, abs=1e-5)
 
@@ -36,13 +37,13 @@ def test_dc_gain_of_a_lag_is_exact(K: float) -> None:
 def test_offset_is_found() -> None:
     plant, params = lag.make(K=0.5, T=0.2)
     raised = dataclasses.replace(plant, output=lambda params, state: state.y + 3.0)
-    gain, offset, *_ = identify.dc_gain(raised, params, KEY)
+    gain, offset, *_ = steady_state.dc_gain(raised, params, KEY)
     assert float(gain) == pytest.approx(0.5, rel=1e-5)
     assert float(offset) == pytest.approx(3.0, rel=1e-5)
 
 
 def test_static_prefilter_inverts_the_identified_line() -> None:
-    actor, params = identify.static(*lag.make(K=0.5, T=0.2), KEY)
+    actor, params = steady_state.static(*lag.make(K=0.5, T=0.2), KEY)
     r = jnp.asarray(0.7, float)
     _, r_tilde = actor.act(params, actor.init(params, r, r), r, r)
     assert float(r_tilde) == pytest.approx(1.4, rel=1e-4)
@@ -50,13 +51,13 @@ def test_static_prefilter_inverts_the_identified_line() -> None:
 
 
 def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = identify.DcGain(jnp.asarray(0.5, float), jnp.asarray(-3.0, float))
+    found = steady_state.DcGain(jnp.asarray(0.5, float), jnp.asarray(-3.0, float))
 
-    def line(*_: Any) -> identify.DcGain:
+    def line(*_: Any) -> steady_state.DcGain:
         return found
 
-    monkeypatch.setattr(identify, "dc_gain", line)
-    actor, params = identify.static(*make("heaters"), KEY)
+    monkeypatch.setattr(steady_state, "dc_gain", line)
+    actor, params = steady_state.static(*make("heaters"), KEY)
     r = jnp.asarray(10.0, float)
     assert float(actor.act(params, (), r, r)[1]) == pytest.approx(26.0)
 
@@ -72,7 +73,7 @@ def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyP
 )
 def test_why_a_plant_does_not_answer_is_said(overrides: dict[str, float], text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(f"the DC gain of lag can't be found: {text}")):
-        identify.dc_gain(*lag.make(**overrides), KEY)
+        steady_state.dc_gain(*lag.make(**overrides), KEY)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e5])
@@ -80,7 +81,7 @@ def test_a_small_unit_is_no_small_gain(unit: float) -> None:
     """Neither where y has it and r~ has not."""
     plant, params = lag.make()
     one = replace(plant, output=lambda params, state: unit * state.y, setpoint_range=(-unit, unit))
-    assert float(identify.dc_gain(one, params, KEY).gain) == pytest.approx(0.5 * unit, rel=1e-3)
+    assert float(steady_state.dc_gain(one, params, KEY).gain) == pytest.approx(0.5 * unit, rel=1e-3)
 
 
 # The lag with K = 0.5, T = 0.3 s and a dead time of 2.5 steps of 0.1 s: two steps pass, then r~ jumps half way.
@@ -91,7 +92,7 @@ TRUE = ARX(np.array(A), np.array(B), 0.0, 2, 0.0)
 
 @pytest.fixture(scope="module")
 def data() -> Record:
-    return identify.record(*lag.make(), KEY, 40)
+    return records.record(*lag.make(), KEY, 40)
 
 
 def test_record_is_the_response_to_levels_held_from_long_to_briefly(data: Record) -> None:
@@ -114,7 +115,7 @@ def test_record_is_the_response_to_levels_held_from_long_to_briefly(data: Record
 
 
 def test_arx_model_of_a_lag_is_exact_without_noise(data: Record) -> None:
-    found = identify.fit_arx(data, 2, 2)
+    found = linear_models.fit_arx(data, 2, 2)
     np.testing.assert_allclose(found.a, A, atol=1e-6)
     np.testing.assert_allclose(found.b, B, atol=1e-6)
     assert found.c == pytest.approx(0.0, abs=1e-6)
@@ -129,7 +130,7 @@ def test_arx_model_has_the_offset_and_the_size_of_the_noise(data: Record) -> Non
     for k in range(3, 50):
         e = rng.normal(0.0, 0.05, len(y))
         y[:, k + 1] = A[0] * y[:, k] + B[0] * data.r_tilde[:, k - 2] + B[1] * data.r_tilde[:, k - 3] + 0.2 + e
-    found = identify.fit_arx(Record(data.r_tilde, y), 2, 2)
+    found = linear_models.fit_arx(Record(data.r_tilde, y), 2, 2)
     np.testing.assert_allclose(found.a, A, atol=0.05)
     np.testing.assert_allclose(found.b, B, atol=0.005)
     assert found.c == pytest.approx(0.2, abs=0.05)
@@ -138,19 +139,19 @@ def test_arx_model_has_the_offset_and_the_size_of_the_noise(data: Record) -> Non
 
 @pytest.mark.parametrize("dead", [0, 1, 3])
 def test_wrong_dead_time_fits_worse(dead: int, data: Record) -> None:
-    assert identify.fit_arx(data, 2, dead).sigma > 1e-2
+    assert linear_models.fit_arx(data, 2, dead).sigma > 1e-2
 
 
 @pytest.mark.parametrize("horizon", [1, 10, 47])
 def test_true_model_predicts_without_error(horizon: int, data: Record) -> None:
-    assert identify.predict(TRUE, data, horizon).shape[::2] == (40, horizon)
-    assert identify.prediction_error(TRUE, data, horizon) < 1e-5
+    assert linear_models.predict(TRUE, data, horizon).shape[::2] == (40, horizon)
+    assert linear_models.prediction_error(TRUE, data, horizon) < 1e-5
 
 
 def test_prediction_error_is_that_of_the_free_run_by_hand() -> None:
     """Y doubles in truth; the model says y_(k+1) = y_k + r~_k: of 2 and 4 it predicts 1 + 1 and 2 + 1."""
     data = Record(np.ones((1, 2)), np.array([[1.0, 2.0, 4.0]]))
     model = ARX(np.ones(1), np.ones(1), 0.0, 0, 0.0)
-    np.testing.assert_allclose(identify.predict(model, data, 2), [[[2.0, 3.0]]])
-    assert identify.prediction_error(model, data, 2) == pytest.approx(np.sqrt((0.0**2 + 1.0**2) / 2))
-    np.testing.assert_allclose(identify.predict(model, data, 1), [[[2.0], [3.0]]])
+    np.testing.assert_allclose(linear_models.predict(model, data, 2), [[[2.0, 3.0]]])
+    assert linear_models.prediction_error(model, data, 2) == pytest.approx(np.sqrt((0.0**2 + 1.0**2) / 2))
+    np.testing.assert_allclose(linear_models.predict(model, data, 1), [[[2.0], [3.0]]])

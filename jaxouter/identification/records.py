@@ -1,0 +1,58 @@
+"""Records of a plant under random r~: what identification is made from."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxouter.loop.references import telegraph
+from jaxouter.plants import Plant, host, simulate
+from jaxouter.plants.base import RUN_ONCE
+
+
+class Record(NamedTuple):
+    """Signals of exciting episodes, oldest first."""
+
+    r_tilde: np.ndarray  # (episodes, T), held over each control step
+    y: np.ndarray  # (episodes, T + 1), y_0 to y_T
+
+
+def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Record:
+    """Input and output under random r~: levels over its whole range, held long in some episodes, briefly in others.
+
+    Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
+    log-uniform from four times an episode to every other step.
+    """
+    keys, n = jax.random.split(key, episodes), host.side_by_side(plant) or episodes
+    parts = [_episodes(plant, params, keys[i : i + n]) for i in range(0, episodes, n)]
+    return Record(*(np.concatenate(column).astype(np.float64) for column in zip(*parts, strict=True)))
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
+def _episodes(plant: Plant, params: Any, keys: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+    """r~ (episodes, T) and y (episodes, T + 1)."""
+
+    def episode(key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+        key_start, key_rate, key_levels, key_run = jax.random.split(key, 4)
+        steps = plant.episode_steps
+        rate = jnp.exp(jax.random.uniform(key_rate, (), float, jnp.log(4.0 / steps), jnp.log(0.5)))
+        r_tilde = telegraph(key_levels, steps, *plant.r_tilde_bounds, rate)
+        state = plant.training_start(key_start, params)
+        y0 = plant.output(params, state)
+        y = simulate(plant, params, r_tilde, key_run, state)
+        return r_tilde, jnp.concatenate([y0[None], y])
+
+    return jax.vmap(episode)(keys)
+
+
+def within(data: Record, bounds: tuple[float, float]) -> Record:
+    """The record without what came after y had left the bounds, by far: there it is nan."""
+    low, high = bounds
+    far = 4.0 * (high - low)
+    gone = np.maximum.accumulate(~((data.y >= low - far) & (data.y <= high + far)), axis=1)
+    return data._replace(y=np.where(gone, np.nan, data.y))
