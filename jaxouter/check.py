@@ -1,4 +1,4 @@
-"""`python -m jaxouter.check`: does a plant keep the contract, and what is it like."""
+"""`python -m jaxouter.check`: does a plant implement the interface, and what is it like."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ SOON = 10  # control steps after the beginning, at least
 
 @dataclass(frozen=True)
 class Options:
-    """Test whether a plant of your own keeps the contract, and show how it responds to r~.
+    """Test whether your own plant implements the interface, and show how it responds to r~.
 
-    Exit status 1 where it does not. Of a log it is told how far its models can be trusted. With --figure it is drawn
-    too: y after r~ has moved up or down from the middle of its range; or what the models of a log tell.
+    The exit status is 1 if it does not. Models of recorded data (log:FILE) are validated instead. With --figure the
+    result is drawn too: y after r~ has moved up or down from the middle of its range, or the validation of the models.
     """
 
     plant: Annotated[str, tyro.conf.Positional]
@@ -59,10 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         cli.use_compilation_cache()
         progress.phase("checking")
         found = [("shapes and types", None), *interface.behaviour(plant, params)]
-        cli.table(f"{plant.name}: the contract", ["what", "is"], [[what, wrong or "kept"] for what, wrong in found])
+        rows = [[what, wrong or "implemented"] for what, wrong in found]
+        cli.table(f"{plant.name}: the interface", ["what", "is"], rows)
         if plant.identified:
             progress.phase("validating")
-            draw = log_report(plant, options.plant.partition(":")[2])
+            draw = validation_report(plant, options.plant.partition(":")[2])
         else:
             progress.phase("responding")
             draw = response_report(plant, params)
@@ -74,11 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(1)
 
 
-def log_report(plant: Plant, path: str) -> Callable[[Path], Path]:
-    """How far the log of this plant can be trusted; returns what draws it."""
-    told = validation.report(*recorded_data.identified(path))
+def validation_report(plant: Plant, path: str) -> Callable[[Path], Path]:
+    """Validate the models of recorded data; returns what draws the validation."""
+    told = validation.validate(*recorded_data.identified(path))
     rows = [list(row) for row in validation.table(told, plant.y_unit, plant.time_unit)]
-    cli.table(f"{plant.name}: how far the log can be trusted", ["what", "is"], rows)
+    cli.table(f"{plant.name}: model validation", ["what", "is"], rows)
     for warning in told.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return lambda figure: figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)

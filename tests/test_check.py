@@ -20,11 +20,11 @@ def forgotten():
         yield
 
 
-def test_a_plant_that_keeps_the_contract(tmp_path, capsys):
+def test_a_plant_that_implements_the_interface(tmp_path, capsys):
     figure = tmp_path / "steps.png"
     check.main([f"{TANKS}:Tanks", "--figure", str(figure)])
     out = capsys.readouterr().out
-    assert out.count("kept") == 5
+    assert out.count("implemented") == 5
     assert "DC gain" in out
     assert figure.read_bytes().startswith(b"\x89PNG")
 
@@ -53,7 +53,7 @@ def test_a_log_is_told_how_far_it_can_be_trusted(tmp_path, capsys):
     figure = tmp_path / "log.png"
     check.main([f"log:{path}", "--figure", str(figure)])
     out = capsys.readouterr().out
-    assert "tank-3: how far the log can be trusted" in out
+    assert "tank-3: model validation" in out
     assert "held out, free run" in out
     assert figure.read_bytes().startswith(b"\x89PNG")
 

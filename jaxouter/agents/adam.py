@@ -46,3 +46,10 @@ def adam(
         return step, AdamState(steps, mean, square)
 
     return optax.GradientTransformation(init, update)
+
+
+def descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
+    """Parameters and optimiser state after one step."""
+    with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
+        step, state = optimiser.update(gradient, state, params)
+    return optax.apply_updates(params, step), state

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxouter.agents.adam import adam
+from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
 from jaxouter.agents.networks import Actor, Critic
 from jaxouter.agents.noise import ornstein_uhlenbeck
@@ -133,13 +133,6 @@ def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.
         next_q: (critics,).
     """
     return reward + discount * jnp.min(next_q)
-
-
-def descend(optimiser: optax.GradientTransformation, gradient: Any, state: Any, params: Any) -> tuple[Any, Any]:
-    """Parameters and optimiser state after one step."""
-    with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
-        step, state = optimiser.update(gradient, state, params)
-    return optax.apply_updates(params, step), state
 
 
 def where(condition: jax.Array, tree: Any, other: Any) -> Any:

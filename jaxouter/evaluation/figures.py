@@ -13,7 +13,7 @@ from jaxouter.evaluation.drawing import Axes, Figure, LogLocator, NullFormatter
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.identification.validation import COHERENT, Report
+from jaxouter.identification.validation import COHERENT, Validation
 from jaxouter.plants import Plant
 
 INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"
@@ -265,7 +265,7 @@ def live(path: Path, steps: Mapping[str, np.ndarray], unit: str = "1") -> Path:
     return save(figure, path)
 
 
-def log_report(path: Path, report: Report, title: str, y_unit: str = "1", time_unit: str = "s") -> Path:
+def log_report(path: Path, report: Validation, title: str, y_unit: str = "1", time_unit: str = "s") -> Path:
     """What a log tells: the held-out free run, the step responses, and the levels and frequencies of its r~.
 
     Args:
@@ -285,7 +285,7 @@ def log_report(path: Path, report: Report, title: str, y_unit: str = "1", time_u
     return save(figure, path)
 
 
-def _held_out(axes: Axes, report: Report, unit: str, time_unit: str) -> None:
+def _held_out(axes: Axes, report: Validation, unit: str, time_unit: str) -> None:
     """Y of the last quarter, and what the models of the rest make of it."""
     curves = report.curves
     shown = slice(min(len(curves.time), HELD_OUT_ROWS))
@@ -301,7 +301,7 @@ def _held_out(axes: Axes, report: Report, unit: str, time_unit: str) -> None:
     axes.legend(fontsize=7.5, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
 
 
-def _step_responses(axes: Axes, report: Report, time_unit: str) -> None:
+def _step_responses(axes: Axes, report: Validation, time_unit: str) -> None:
     nominal, *members = report.curves.responses
     t = report.control_step * np.arange(len(nominal))
     for i, member in enumerate(members):
@@ -314,7 +314,7 @@ def _step_responses(axes: Axes, report: Report, time_unit: str) -> None:
     axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
 
 
-def _levels(axes: Axes, report: Report, unit: str) -> None:
+def _levels(axes: Axes, report: Validation, unit: str) -> None:
     edges, levels = report.curves.edges, report.curves.levels
     axes.bar(edges[:-1], 100.0 * levels, np.diff(edges), align="edge", color=MODIFIED, alpha=0.75)
     for i, (low, high) in enumerate(report.levels_unseen):
@@ -327,7 +327,7 @@ def _levels(axes: Axes, report: Report, unit: str) -> None:
         axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
 
 
-def _frequencies(axes: Axes, report: Report, time_unit: str) -> None:
+def _frequencies(axes: Axes, report: Validation, time_unit: str) -> None:
     curves = report.curves
     axes.axvspan(curves.frequency[0], report.needed, color=LEARNED, alpha=0.1, lw=0, label="needed")
     axes.plot(curves.frequency, curves.coherence, color=LEARNED, lw=1.4, label="coherence of r̃ and y")

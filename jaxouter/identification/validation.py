@@ -1,4 +1,4 @@
-"""How far a log can be trusted: what its models predict of rows they have not seen, and where it does not excite."""
+"""Model validation: what models of recorded data predict of rows that they have not seen, and what is not excited."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy import signal
 
 from jaxouter.identification.linear_models import gain, settling, step_response
-from jaxouter.identification.recorded_data import Ensemble, Log, free_run, without_last_quarter
+from jaxouter.identification.recorded_data import Ensemble, RecordedData, free_run, without_last_quarter
 from jaxouter.plants.arx import Model
 
 Intervals = tuple[tuple[float, float], ...]
@@ -37,8 +37,8 @@ class Curves(NamedTuple):
     power: np.ndarray  # (F,), of r~
 
 
-class Report(NamedTuple):
-    """What a log tells; times in its unit of time, frequencies in cycles a unit of time."""
+class Validation(NamedTuple):
+    """What a record tells; times in its unit of time, frequencies in cycles a unit of time."""
 
     rows: int
     control_step: float
@@ -48,7 +48,7 @@ class Report(NamedTuple):
     gain_range: tuple[float, float]  # 90 % of the ensemble
     rise_time: float  # 10 to 90 % of a step
     settling_time: float  # to 5 % of a step
-    length: float  # of the log, in settling times
+    length: float  # of the record, in settling times
     moves: int  # of r~
     moves_held_out: int  # of them in the last quarter
     error_one_step: float  # on the last quarter, by a model of the rest: RMSE
@@ -68,50 +68,50 @@ class Report(NamedTuple):
     curves: Curves
 
 
-def report(log: Log, models: Ensemble, seed: int = 0) -> Report:
-    """What a log tells, and how far it can be trusted.
+def validate(data: RecordedData, models: Ensemble, seed: int = 0) -> Validation:
+    """Validate the models of recorded data.
 
     The errors are those of the models of its first three quarters on the last one, which had no part in the choice of
     order and dead time either.
 
     Args:
-        log: as `read` gives it.
-        models: of the whole log.
+        data: as `read` gives it.
+        models: of the whole record.
         seed: of blocks and noise.
     """
-    cut = 3 * len(log.time) // 4
-    tried = without_last_quarter(log, models, seed)
-    rows = min(len(log.time) - cut, LONGEST_RUN)
-    y, told = log.y[cut : cut + rows], free_run(tried.nominal, log, cut, rows)
-    one_step = _one_step(tried.nominal, log, cut)
-    band = _band(tried, log, cut, rows, np.random.default_rng(seed))
-    spread, of_these = float(np.std(log.y)), max(float(np.std(log.y[cut:])), 1e-9 * float(np.std(log.y)))
+    cut = 3 * len(data.time) // 4
+    tried = without_last_quarter(data, models, seed)
+    rows = min(len(data.time) - cut, LONGEST_RUN)
+    y, told = data.y[cut : cut + rows], free_run(tried.nominal, data, cut, rows)
+    one_step = _one_step(tried.nominal, data, cut)
+    band = _band(tried, data, cut, rows, np.random.default_rng(seed))
+    spread, of_these = float(np.std(data.y)), max(float(np.std(data.y[cut:])), 1e-9 * float(np.std(data.y)))
     settled = max(settling(models.nominal), 1)
     rise = _rise(models.nominal, settled)
     gains = np.quantile([gain(model) for model in models.members], SPREAD)
-    levels, edges = np.histogram(log.r_tilde, BINS)
-    frequency, coherence, power = _excitation(log, settled)
-    needed = 1.0 / (rise * log.step)
+    levels, edges = np.histogram(data.r_tilde, BINS)
+    frequency, coherence, power = _excitation(data, settled)
+    needed = 1.0 / (rise * data.step)
     matter = frequency <= max(needed, frequency[0])
-    unweighed = Report(
-        rows=len(log.time),
-        control_step=log.step,
+    unweighed = Validation(
+        rows=len(data.time),
+        control_step=data.step,
         order=models.order,
-        dead_time=models.dead * log.step,
+        dead_time=models.dead * data.step,
         gain=gain(models.nominal),
         gain_range=(float(gains[0]), float(gains[1])),
-        rise_time=rise * log.step,
-        settling_time=settled * log.step,
-        length=len(log.time) / settled,
-        moves=int(np.count_nonzero(np.diff(log.r_tilde))),
-        moves_held_out=int(np.count_nonzero(np.diff(log.r_tilde[cut:]))),
+        rise_time=rise * data.step,
+        settling_time=settled * data.step,
+        length=len(data.time) / settled,
+        moves=int(np.count_nonzero(np.diff(data.r_tilde))),
+        moves_held_out=int(np.count_nonzero(np.diff(data.r_tilde[cut:]))),
         error_one_step=_root_mean_square(one_step),
         error_free_run=_root_mean_square(y - told),
         fit_one_step=1.0 - (_root_mean_square(one_step) / of_these) ** 2,
         fit_free_run=1.0 - (_root_mean_square(y - told) / of_these) ** 2,
         coverage=float(np.mean((y >= band[0]) & (y <= band[1]))),
         bias=float(np.mean(y - told)) / spread,
-        nonlinearity=_nonlinearity(models.nominal, log, settled) / spread,
+        nonlinearity=_nonlinearity(models.nominal, data, settled) / spread,
         levels_seen=float(np.mean(levels > 0)),
         levels_unseen=_runs(levels == 0, edges),
         needed=needed,
@@ -120,12 +120,12 @@ def report(log: Log, models: Ensemble, seed: int = 0) -> Report:
         redrawn=models.redrawn,
         warnings=(),
         curves=Curves(
-            time=log.time[cut : cut + rows],
+            time=data.time[cut : cut + rows],
             y=y,
             free_run=told,
             band=band,
             responses=np.stack([step_response(model, 2 * settled + 2) for model in (models.nominal, *models.members)]),
-            levels=levels / len(log.r_tilde),
+            levels=levels / len(data.r_tilde),
             edges=edges,
             frequency=frequency,
             coherence=coherence,
@@ -139,17 +139,17 @@ def _root_mean_square(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def _one_step(model: Model, log: Log, first: int) -> np.ndarray:
+def _one_step(model: Model, data: RecordedData, first: int) -> np.ndarray:
     """What the model does not tell a step ahead, of the rows from `first` on."""
-    of_y = signal.lfilter(np.append(1.0, -model.a), [1.0], log.y)
-    of_r_tilde = signal.lfilter(np.append(0.0, model.b), [1.0], log.r_tilde)
+    of_y = signal.lfilter(np.append(1.0, -model.a), [1.0], data.y)
+    of_r_tilde = signal.lfilter(np.append(0.0, model.b), [1.0], data.r_tilde)
     return (np.asarray(of_y) - np.asarray(of_r_tilde))[first:] - model.c
 
 
-def _band(models: Ensemble, log: Log, first: int, rows: int, rng: np.random.Generator) -> np.ndarray:
+def _band(models: Ensemble, data: RecordedData, first: int, rows: int, rng: np.random.Generator) -> np.ndarray:
     """Quantiles of what the members with their noise make of the rows from `first` on; (2, rows)."""
     paths = [
-        free_run(model, log, first, rows)
+        free_run(model, data, first, rows)
         + signal.lfilter([1.0], np.append(1.0, -model.a), model.sigma * rng.standard_normal((PATHS, rows)))
         for model in models.members
     ]
@@ -162,21 +162,21 @@ def _rise(model: Model, settled: int) -> int:
     return max(1, int(np.argmax(share >= 0.9) - np.argmax(share >= 0.1)))
 
 
-def _excitation(log: Log, settled: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _excitation(data: RecordedData, settled: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies above zero, coherence of r~ and y, and power of r~, from segments of four settling times or less."""
-    segment = min(max(4 * settled, 32), len(log.time) // 8)
-    rate = 1.0 / log.step
+    segment = min(max(4 * settled, 32), len(data.time) // 8)
+    rate = 1.0 / data.step
     with np.errstate(invalid="ignore", divide="ignore"):
-        frequency, coherence = signal.coherence(log.r_tilde, log.y, rate, nperseg=segment)
-    power = signal.welch(log.r_tilde, rate, nperseg=segment)[1]
+        frequency, coherence = signal.coherence(data.r_tilde, data.y, rate, nperseg=segment)
+    power = signal.welch(data.r_tilde, rate, nperseg=segment)[1]
     return frequency[1:], np.nan_to_num(coherence[1:]), power[1:]
 
 
-def _nonlinearity(model: Model, log: Log, settled: int) -> float:
+def _nonlinearity(model: Model, data: RecordedData, settled: int) -> float:
     """Root mean square of the mean error of a free run at each level, beyond what chance makes of it."""
-    first = min(len(model.b) + settled, len(log.time) // 2)
-    told = free_run(model, log, first, len(log.time) - first)
-    error = log.y[first:] - told
+    first = min(len(model.b) + settled, len(data.time) // 2)
+    told = free_run(model, data, first, len(data.time) - first)
+    error = data.y[first:] - told
     error = error - error.mean()
     of_level = np.searchsorted(np.unique(np.quantile(told, np.linspace(0.0, 1.0, QUANTILES + 1)[1:-1])), told)
     rows = np.bincount(of_level)
@@ -200,18 +200,18 @@ def _told(intervals: Sequence[tuple[float, float]]) -> str:
     return ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals)
 
 
-def _gaps(report: Report) -> Intervals:
+def _gaps(found: Validation) -> Intervals:
     """Frequencies that matter at which y does not show r~."""
-    frequency, coherence = report.curves.frequency, report.curves.coherence
-    matter = frequency <= max(report.needed, frequency[0])
+    frequency, coherence = found.curves.frequency, found.curves.coherence
+    matter = frequency <= max(found.needed, frequency[0])
     return _runs(coherence[matter] <= COHERENT, _edges(frequency)[: np.count_nonzero(matter) + 1])
 
 
-def _warnings(it: Report) -> list[str]:
+def _warnings(it: Validation) -> list[str]:
     """What is weak, and what to do about it."""
     low, high = it.gain_range
     weak = {
-        f"the log is only {it.length:.3g} settling times long; 20 or more show how much the models may differ": (
+        f"the record is only {it.length:.3g} settling times long; 20 or more show how much the models may differ": (
             it.length < 20
         ),
         f"r~ moves only {it.moves} times; each move is one look at how y answers, so move it 20 times or more": (
@@ -236,31 +236,31 @@ def _warnings(it: Report) -> list[str]:
         "linear; keep set-points to a narrower range": it.nonlinearity > 0.05,
         f"{it.redrawn} members were unstable and drawn again": it.redrawn > 0,
         "y rises within two control steps; a shorter step would show how": it.rise_time < 2.5 * it.control_step,
-        f"y takes {it.rise_time / it.control_step:.0f} control steps to rise; with every n-th row of the log, so that "
+        f"y takes {it.rise_time / it.control_step:.0f} control steps to rise; with every n-th row, so that "
         "it takes 5 to 20, the outer loop would see further back": it.rise_time > 150 * it.control_step,
     }
     return [text for text, is_weak in weak.items() if is_weak]
 
 
-def table(report: Report, y_unit: str = "1", time_unit: str = "s") -> list[tuple[str, str]]:
-    """The report as rows of a table: what, and how much."""
+def table(found: Validation, y_unit: str = "1", time_unit: str = "s") -> list[tuple[str, str]]:
+    """The validation as rows of a table: what, and how much."""
     y, t = "" if y_unit in ("", "1") else f" {y_unit}", time_unit
-    low, high = report.gain_range
+    low, high = found.gain_range
     return [
-        ("rows", f"{report.rows} of {report.control_step:.3g} {t}, {report.length:.3g} settling times"),
-        ("model", f"order {report.order}, dead time {report.dead_time:.3g} {t}"),
-        ("DC gain", f"{report.gain:.3g} ({low:.3g} to {high:.3g})"),
-        ("rise, settling", f"{report.rise_time:.3g} {t}, {report.settling_time:.3g} {t}"),
+        ("rows", f"{found.rows} of {found.control_step:.3g} {t}, {found.length:.3g} settling times"),
+        ("model", f"order {found.order}, dead time {found.dead_time:.3g} {t}"),
+        ("DC gain", f"{found.gain:.3g} ({low:.3g} to {high:.3g})"),
+        ("rise, settling", f"{found.rise_time:.3g} {t}, {found.settling_time:.3g} {t}"),
         (
             "held out, one step",
-            f"RMSE {report.error_one_step:.3g}{y}, {max(report.fit_one_step, 0.0):.1%} of the variance",
+            f"RMSE {found.error_one_step:.3g}{y}, {max(found.fit_one_step, 0.0):.1%} of the variance",
         ),
         (
             "held out, free run",
-            f"RMSE {report.error_free_run:.3g}{y}, {max(report.fit_free_run, 0.0):.1%} of the variance",
+            f"RMSE {found.error_free_run:.3g}{y}, {max(found.fit_free_run, 0.0):.1%} of the variance",
         ),
-        ("held out, in the band of 90 %", f"{report.coverage:.0%}"),
-        ("levels of r~ seen", f"{report.levels_seen:.0%}, {report.moves} moves"),
-        ("frequencies shown", f"{report.excited_share:.0%} of those up to {report.needed:.3g} /{t}"),
-        ("error by the level of y", f"{report.nonlinearity:.2g} of its standard deviation"),
+        ("held out, in the band of 90 %", f"{found.coverage:.0%}"),
+        ("levels of r~ seen", f"{found.levels_seen:.0%}, {found.moves} moves"),
+        ("frequencies shown", f"{found.excited_share:.0%} of those up to {found.needed:.3g} /{t}"),
+        ("error by the level of y", f"{found.nonlinearity:.2g} of its standard deviation"),
     ]

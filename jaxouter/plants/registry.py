@@ -14,7 +14,6 @@ import hashlib
 import importlib.util
 import inspect
 import logging
-import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -34,11 +33,11 @@ from jaxouter.plants.errors import PlantError, Raised, said
 from jaxouter.plants.simulators import PlantOptions
 
 GROUP = "jaxouter.plants"  # of entry points
-KINDS = {
-    "gym": "jaxouter.plants.simulators:from_gymnasium",
-    "fmu": "jaxouter.plants.simulators:from_fmu",
-    "log": "jaxouter.identification.recorded_data:make",  # by name, for identification stands on the plants
+KINDS: dict[str, Callable[[str, str, PlantOptions], tuple[Plant, Any]]] = {
+    "gym": simulators.from_gymnasium,
+    "fmu": simulators.from_fmu,
 }
+"""Makers of plants KIND:WHICH, by kind; `jaxouter.identification`, which stands on the plants, adds log:FILE."""
 FORMS = "FILE.py:NAME, gym:ID, fmu:FILE, log:FILE"
 
 
@@ -106,7 +105,7 @@ def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tup
     """Short name, maker and file of a plant."""
     kind, _, rest = reference.partition(":")
     if kind in KINDS:
-        make, path = pkgutil.resolve_name(KINDS[kind]), simulators.file_of(rest) if kind == "gym" else Path(rest)
+        make, path = KINDS[kind], simulators.file_of(rest) if kind == "gym" else Path(rest)
         if not path.is_file():
             raise ValueError(f"{reference}: there is no file {rest}")
         name = _short(re.split("[/:]", rest)[-1] if kind == "gym" else path.stem)

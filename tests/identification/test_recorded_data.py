@@ -16,7 +16,7 @@ from pyarrow import parquet
 from jaxouter import plants
 from jaxouter.identification import linear_models
 from jaxouter.identification import recorded_data as logs
-from jaxouter.identification.recorded_data import Log
+from jaxouter.identification.recorded_data import RecordedData
 from jaxouter.loop import environment
 from jaxouter.plants.simulators import PlantOptions
 from tests import kinds, lag
@@ -27,27 +27,27 @@ KEY = jax.random.key(0)
 
 
 @pytest.fixture(scope="module")
-def clean() -> Log:
+def clean() -> RecordedData:
     return recorded(*lag.make(), rows=600)
 
 
 @pytest.fixture(scope="module")
-def noisy() -> Log:
+def noisy() -> RecordedData:
     return recorded(*lag.make(), rows=800, noise=0.05)
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory, noisy: Log) -> Path:
+def path(tmp_path_factory: pytest.TempPathFactory, noisy: RecordedData) -> Path:
     return write(tmp_path_factory.mktemp("logs") / "lag.csv", noisy)
 
 
-def test_csv_is_read_as_it_was_written(path: Path, noisy: Log) -> None:
+def test_csv_is_read_as_it_was_written(path: Path, noisy: RecordedData) -> None:
     for column, expected in zip(logs.read(path), noisy, strict=True):
         np.testing.assert_array_equal(column, expected)
     assert logs.read(path).step == 0.1
 
 
-def test_parquet_is_read_as_it_was_written(tmp_path: Path, clean: Log) -> None:
+def test_parquet_is_read_as_it_was_written(tmp_path: Path, clean: RecordedData) -> None:
     file = tmp_path / "lag.parquet"
     parquet.write_table(pyarrow.table({"mode": ["auto"] * 600, **clean._asdict()}), file)
     for column, expected in zip(logs.read(str(file)), clean, strict=True):
@@ -58,8 +58,8 @@ def test_other_columns_any_order_and_a_byte_order_mark_do_no_harm(tmp_path: Path
     rows = "\n".join(f"{k % 7}, x, {k}, {k * 0.5}" for k in range(200))
     file = tmp_path / "log.csv"
     file.write_text(f"\ufeffy, mode, r_tilde, time\n{rows}\n\n", encoding="utf-8")
-    log = logs.read(file)
-    assert (log.time[2], log.r_tilde[2], log.y[2]) == (1.0, 2.0, 2.0)
+    data = logs.read(file)
+    assert (data.time[2], data.r_tilde[2], data.y[2]) == (1.0, 2.0, 2.0)
 
 
 def changed(column: str, row: int, value: object) -> str:
@@ -97,7 +97,7 @@ def test_what_is_wrong_is_named_with_its_row(tmp_path: Path, text: str, words: l
 
 
 def test_a_file_that_is_none_of_these_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"there is no log .*none\.csv"):
+    with pytest.raises(ValueError, match=r"there is no recorded data .*none\.csv"):
         logs.read(tmp_path / "none.csv")
     with pytest.raises(ValueError, match=r"log\.xlsx is neither \.csv nor \.parquet"):
         logs.read("log.xlsx")
@@ -122,7 +122,7 @@ def step_of_lag(steps: int, K: float = 0.5, T: float = 0.3, d: float = 0.25) -> 
     return K * np.where(t > d, 1.0 - np.exp(-np.maximum(t - d, 0.0) / T), 0.0)
 
 
-def test_a_clean_log_gives_the_lag_exactly(clean: Log) -> None:
+def test_a_clean_log_gives_the_lag_exactly(clean: RecordedData) -> None:
     models = logs.ensemble(clean)
     assert (models.order, models.dead) == (2, 2)
     for model in (models.nominal, *models.members):
@@ -132,7 +132,7 @@ def test_a_clean_log_gives_the_lag_exactly(clean: Log) -> None:
     assert linear_models.settling(models.nominal) == 12  # 0.25 s + 3 T = 1.15 s
 
 
-def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: Log) -> None:
+def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: RecordedData) -> None:
     """The noise is 5 % of the standard deviation of y."""
     models = logs.ensemble(noisy)
     gains = [linear_models.gain(model) for model in models.members]
@@ -147,8 +147,8 @@ def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: Log) -> No
 
 def test_pitch_is_identified_from_its_log() -> None:
     plant, params = plants.make("pitch")
-    log = recorded(plant, params, rows=2_000, redraw=0.03)
-    models = logs.ensemble(log, members=2)
+    data = recorded(plant, params, rows=2_000, redraw=0.03)
+    models = logs.ensemble(data, members=2)
     assert linear_models.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
     assert models.dead == 5  # 0.5 s
     base = np.zeros(150)
@@ -158,8 +158,8 @@ def test_pitch_is_identified_from_its_log() -> None:
 
 @pytest.mark.parametrize(("dead", "rows"), [(70, 600), (90, 1_200)])
 def test_a_long_dead_time_is_found(dead: int, rows: int) -> None:
-    log = recorded(*kinds.late(dead)(), rows=rows, noise=0.01)
-    models = logs.ensemble(log, members=2)
+    data = recorded(*kinds.late(dead)(), rows=rows, noise=0.01)
+    models = logs.ensemble(data, members=2)
     assert models.dead == dead
     assert linear_models.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
 
@@ -176,21 +176,21 @@ def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_sett
 
 @pytest.mark.parametrize(("plant", "words"), [(kinds.Integrating, "y integrates r~"), (kinds.Unstable, "are unstable")])
 def test_all_commands_refuse_alike_what_does_not_settle(tmp_path: Path, plant: kinds.Maker, words: str) -> None:
-    log = recorded(*plant(), rows=400)
+    data = recorded(*plant(), rows=400)
     with pytest.raises(ValueError, match=words):
-        logs.ensemble(log)
+        logs.ensemble(data)
     with pytest.raises(ValueError, match=words):  # `check` and `train` both make the plant, and see this alone
-        logs.make("log", str(write(tmp_path / "log.csv", log)))
+        logs.make("log", str(write(tmp_path / "log.csv", data)))
 
 
-def test_what_cannot_be_validated_is_refused_before_it_is_a_plant(tmp_path: Path, clean: Log) -> None:
+def test_what_cannot_be_validated_is_refused_before_it_is_a_plant(tmp_path: Path, clean: RecordedData) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(logs, "without_last_quarter", lambda *_: logs.ensemble(clean, members=1))
         with pytest.raises(ValueError, match="members is 1"):
             logs.make("log", str(write(tmp_path / "log.csv", clean)))
 
 
-def test_free_run_continues_from_what_was_recorded(clean: Log) -> None:
+def test_free_run_continues_from_what_was_recorded(clean: RecordedData) -> None:
     models = logs.ensemble(clean, members=2)
     np.testing.assert_allclose(logs.free_run(models.nominal, clean, 300, 250), clean.y[300:550], atol=1e-5)
 
@@ -200,23 +200,23 @@ def test_what_never_comes_to_rest_is_refused() -> None:
     r_tilde = np.repeat(rng.uniform(-1.0, 1.0, 30), 10)
     y = 1e-3 * np.exp(0.05 * np.arange(300)) + 0.1 * np.cumsum(r_tilde)
     with pytest.raises(ValueError, match="unstable"):
-        logs.ensemble(Log(0.1 * np.arange(300), r_tilde, y))
+        logs.ensemble(RecordedData(0.1 * np.arange(300), r_tilde, y))
 
 
-def test_too_few_members_are_refused(clean: Log) -> None:
+def test_too_few_members_are_refused(clean: RecordedData) -> None:
     with pytest.raises(ValueError, match="members is 1; it must be at least 2"):
         logs.ensemble(clean, members=1)
 
 
 @of_single_draws  # of other draws the models may agree by chance
-def test_an_output_that_has_nothing_to_do_with_r_tilde_is_refused(tmp_path: Path, clean: Log) -> None:
+def test_an_output_that_has_nothing_to_do_with_r_tilde_is_refused(tmp_path: Path, clean: RecordedData) -> None:
     noise = clean._replace(y=np.random.default_rng(0).standard_normal(600))
     file = write(tmp_path / "noise.csv", noise)
     with pytest.raises(ValueError, match="do not agree on any y"):
         logs.make("log", str(file))
 
 
-def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: Log) -> None:
+def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: RecordedData) -> None:
     plant, params = logs.make("log", str(path))
     low, high = plant.r_tilde_bounds
     assert (low, high) == (noisy.r_tilde.min(), noisy.r_tilde.max())
@@ -239,7 +239,7 @@ def test_what_it_declares_can_be_overridden(path: Path) -> None:
     assert plant.evaluation_range == (-1.0, 0.5)
     narrower, _ = logs.make("log", str(path), PlantOptions(r_tilde_bounds=(-1.0, 1.0)))
     np.testing.assert_allclose(narrower.setpoint_range, (-0.5, 0.5), atol=0.02)
-    with pytest.raises(ValueError, match="a log tells its control step"):
+    with pytest.raises(ValueError, match="recorded data tell their control step"):
         logs.make("log", str(path), PlantOptions(control_step=1.0))
 
 
@@ -254,7 +254,7 @@ def test_an_environment_draws_a_member_for_each_episode(path: Path, monkeypatch:
         environment.make("logged", drawn=(("c", 0.0, 1.0),))
 
 
-def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: Log) -> None:
+def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: RecordedData) -> None:
     file = write(tmp_path / "lag.csv", clean)
     (first, params), (second, _) = logs.make("log", str(file)), logs.make("log", str(file))
     assert hash(first) == hash(second)
@@ -268,7 +268,7 @@ def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: Log) -
 
 def test_an_error_of_identification_names_the_file(tmp_path: Path) -> None:
     t = 0.1 * np.arange(300)
-    file = write(tmp_path / "away.csv", Log(t, np.sin(t), np.exp(0.05 * np.arange(300))))
-    with pytest.raises(ValueError, match=r"away\.csv: the models of this log are unstable"):
+    file = write(tmp_path / "away.csv", RecordedData(t, np.sin(t), np.exp(0.05 * np.arange(300))))
+    with pytest.raises(ValueError, match=r"away\.csv: the models of this record are unstable"):
         logs.make("log", str(file))
     assert math.isfinite(logs.read(file).step)

@@ -10,23 +10,23 @@ import pytest
 
 from jaxouter.evaluation import figures
 from jaxouter.identification import validation
-from jaxouter.identification.recorded_data import Log, ensemble
-from jaxouter.identification.validation import Report
+from jaxouter.identification.recorded_data import RecordedData, ensemble
+from jaxouter.identification.validation import Validation
 from jaxouter.plants import simulate
 from tests import lag
 from tests.logs import recorded
 
 
-def told(log: Log) -> Report:
-    return validation.report(log, ensemble(log))
+def told(data: RecordedData) -> Validation:
+    return validation.validate(data, ensemble(data))
 
 
 @pytest.fixture(scope="module")
-def good() -> Report:
+def good() -> Validation:
     return told(recorded(*lag.make(), rows=1_200, noise=0.05))
 
 
-def test_a_good_log_is_told_to_be_one(good: Report) -> None:
+def test_a_good_log_is_told_to_be_one(good: Validation) -> None:
     assert good.warnings == ()
     assert good.gain_range[0] - 0.005 < 0.5 < good.gain_range[1] + 0.005
     assert good.rise_time == pytest.approx(0.3 * np.log(9.0), abs=0.15)
@@ -53,7 +53,7 @@ def test_one_step_errors_are_those_of_the_equation_by_hand() -> None:
     r_tilde, y = np.repeat(rng.uniform(-1.0, 1.0, n // 10), 10), np.zeros(n)
     for k in range(n - 1):
         y[k + 1] = 0.9 * y[k] + 0.1 * r_tilde[k] + 0.02 * rng.standard_normal()
-    it = told(Log(np.arange(n) / 10, r_tilde, y))
+    it = told(RecordedData(np.arange(n) / 10, r_tilde, y))
     assert it.error_one_step == pytest.approx(0.02, rel=0.1)
     assert it.error_free_run == pytest.approx(0.02 / np.sqrt(1 - 0.81), rel=0.3)
 
@@ -62,7 +62,7 @@ def test_what_a_poor_log_lacks_is_named() -> None:
     """Six moves between two levels, all of them early."""
     r_tilde = np.where((np.arange(300) // 40 % 2 == 0) | (np.arange(300) > 200), -1.0, 3.0)
     y = np.asarray(simulate(*lag.make(), r_tilde, jax.random.key(0))) + np.random.default_rng(0).normal(0, 0.3, 300)
-    it = told(Log(0.1 * np.arange(300), np.append(r_tilde[1:], -1.0), y))  # y_k before r~_k acts
+    it = told(RecordedData(0.1 * np.arange(300), np.append(r_tilde[1:], -1.0), y))  # y_k before r~_k acts
     text = "\n".join(it.warnings)
     for words in ("r~ moves only 6 times", "0 times in the last quarter", "r~ was never at", "frequencies"):
         assert words in text
@@ -72,15 +72,15 @@ def test_what_a_poor_log_lacks_is_named() -> None:
 
 
 def test_a_plant_that_is_not_linear_is_noticed() -> None:
-    log = recorded(*lag.make(), rows=2_000, redraw=0.05)
-    bent = told(log._replace(y=log.y + 0.15 * log.y**2))
+    data = recorded(*lag.make(), rows=2_000, redraw=0.05)
+    bent = told(data._replace(y=data.y + 0.15 * data.y**2))
     assert bent.nonlinearity > 0.05
     assert any("not linear" in text for text in bent.warnings)
 
 
 def test_a_load_in_the_last_quarter_is_noticed() -> None:
-    log = recorded(*lag.make(), rows=1_200, noise=0.02)
-    it = told(log._replace(y=log.y + np.where(np.arange(1_200) > 880, 0.8, 0.0)))
+    data = recorded(*lag.make(), rows=1_200, noise=0.02)
+    it = told(data._replace(y=data.y + np.where(np.arange(1_200) > 880, 0.8, 0.0)))
     assert abs(it.bias) > 0.3
     assert it.coverage < 0.75
     assert any("a load, or a drift" in text for text in it.warnings)
@@ -88,14 +88,14 @@ def test_a_load_in_the_last_quarter_is_noticed() -> None:
 
 
 def test_noise_without_an_answer_is_noticed() -> None:
-    log = recorded(*lag.make(), rows=1_200, noise=3.0)
-    it = told(log)
+    data = recorded(*lag.make(), rows=1_200, noise=3.0)
+    it = told(data)
     assert it.fit_free_run < 0.3
     text = "\n".join(it.warnings)
     assert "a controller from it is a guess" in text
 
 
-def test_the_table_has_units_and_the_figure_is_drawn(good: Report, tmp_path: Path) -> None:
+def test_the_table_has_units_and_the_figure_is_drawn(good: Validation, tmp_path: Path) -> None:
     rows = dict(validation.table(good, "degC"))
     assert rows["rows"].startswith("1200 of 0.1 s, ")
     assert " degC, 99." in rows["held out, free run"]

@@ -1,4 +1,4 @@
-"""A controller that has learned from a log alone, on the true plant."""
+"""A controller that has learned from a record alone, on the true plant."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ import numpy as np
 import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from jaxouter.agents.adam import adam
-from jaxouter.agents.ddpg import descend
+from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.networks import Actor
 from jaxouter.evaluation.baselines.tuning import Report, score, training_episodes
 from jaxouter.evaluation.cache import Tuned
