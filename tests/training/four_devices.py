@@ -15,6 +15,7 @@ from jaxouter.training.off_policy import FIELDS
 from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.run import Run
 from tests import lag
+from tests.additions.reinforce import Reinforce
 from tests.training.small import small
 
 SHORT = dict(steps=1_280, epoch=320, noise_sigma=(1e-4, 0.5))  # two epochs
@@ -61,6 +62,26 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
         action = written[..., FIELDS.index("action")]
         assert len(np.unique(action[:, 0])) == 8  # no two environments draw alike
         assert np.all(np.diff(np.std(np.diff(action[:, 80:]), 1)[::2]) > 0)  # the ladder goes on from shard to shard
+
+
+@pytest.mark.parametrize(("seeds", "shards"), [(1, 4), (2, 2)])
+def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
+    config = replace(small(seeds=seeds, devices=4, steps=1_280, epoch=640), agent=Reinforce(rate=1e-3, sigma=0.1))
+    fleet = Fleet.of(config)
+    assert fleet.trainer.environments.shards == shards
+    trainer, params = Run(None, config).trainer
+    state = fleet.prefill(fleet.put([trainer.start(seed, params) for seed in range(seeds)]), params)
+    before = fleet.take(state)
+    state, metrics = fleet.epoch(state, params, 640)
+    after = fleet.take(state)
+    assert [int(each.steps) for each in after] == [640] * seeds
+    for leaf in jax.tree.leaves((state.agent, metrics)):
+        by_seed = {}
+        for shard in leaf.addressable_shards:
+            np.testing.assert_array_equal(shard.data, by_seed.setdefault(shard.index[0].start, shard.data))
+    for i in range(seeds):
+        assert not np.array_equal(*(jax.tree.leaves(states[i].agent)[0] for states in (before, after)))
+        assert len(np.unique(after[i].obs[:, 0])) == 8  # no two environments are alike
 
 
 def test_checkpoint_of_four_devices_goes_on_with_one(spanning):
