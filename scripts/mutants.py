@@ -46,7 +46,7 @@ MUTANTS = (
     ),
     Mutant(
         "no bootstrap where time is up",
-        "jaxouter/agents/ddpg.py", "jnp.where(terminated[last], 0.0, 1.0)",
+        "jaxouter/agents/returns.py", "jnp.where(terminated[last], 0.0, 1.0)",
         "jnp.where(terminated[last] | truncated[last], 0.0, 1.0)", "tests/agents/test_ddpg.py",
     ),
     Mutant(
@@ -65,8 +65,8 @@ MUTANTS = (
     ),
     Mutant(
         "the observation holds the true output",
-        "jaxouter/loop/environment.py", "self.observer.record(state.memory, state.y_seen, r_tilde)",
-        "self.observer.record(state.memory, state.y, r_tilde)", "tests/loop/test_environment.py",
+        "jaxouter/loop/environment.py", "self.observer.record(state.memory, state.y_seen, loop.r_tilde)",
+        "self.observer.record(state.memory, state.y, loop.r_tilde)", "tests/loop/test_environment.py",
     ),
     Mutant(
         "windows at the end of the replay's ring are stale",

@@ -31,18 +31,8 @@ from jaxouter.training.run import Run, surroundings, write_json
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "soak.json"
 TRAINING = (  # of which a piece as long as a start of the process holds some gradient steps and epochs
     *("heaters", "--pretraining.gradient-steps", "400", "--pretraining.episodes", "8"),
-    *(
-        "--pretraining.batch-size",
-        "16",
-        "--environments",
-        "8",
-        "--agent.prefill",
-        "640",
-        "--epoch",
-        "800",
-        "--agent.replay",
-        "40000",
-    ),
+    *("--pretraining.batch-size", "16", "--environments", "8", "--epoch", "800"),
+    *("--agent.prefill", "640", "--agent.replay", "40000"),
     *("--agent.hidden", "32", "32", "--agent.batch-size", "32", "--agent.updates", "8"),
 )
 

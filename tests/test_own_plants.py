@@ -12,7 +12,7 @@ from jaxouter.plants import registry
 from jaxouter.training.run import Run
 from tests import lag
 from tests.load import ROOT
-from tests.logs import recorded, write
+from tests.recorded import recorded, write
 from tests.training.small import TINY
 
 TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"

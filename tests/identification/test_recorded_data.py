@@ -1,4 +1,4 @@
-"""Reading logs, and the models and the plant that come out of them."""
+"""Reading recorded data, and the models and the plant that come out of them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ import pytest
 from pyarrow import parquet
 
 from jaxouter import plants
-from jaxouter.identification import linear_models
-from jaxouter.identification import recorded_data as logs
+from jaxouter.identification import linear_models, recorded_data
 from jaxouter.identification.recorded_data import RecordedData
 from jaxouter.loop import environment
 from jaxouter.plants.simulators import PlantOptions
 from tests import kinds, lag
-from tests.logs import recorded, write
 from tests.precision import of_single_draws
+from tests.recorded import recorded, write
 
 KEY = jax.random.key(0)
 
@@ -38,19 +37,19 @@ def noisy() -> RecordedData:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory, noisy: RecordedData) -> Path:
-    return write(tmp_path_factory.mktemp("logs") / "lag.csv", noisy)
+    return write(tmp_path_factory.mktemp("records") / "lag.csv", noisy)
 
 
 def test_csv_is_read_as_it_was_written(path: Path, noisy: RecordedData) -> None:
-    for column, expected in zip(logs.read(path), noisy, strict=True):
+    for column, expected in zip(recorded_data.read(path), noisy, strict=True):
         np.testing.assert_array_equal(column, expected)
-    assert logs.read(path).step == 0.1
+    assert recorded_data.read(path).step == 0.1
 
 
 def test_parquet_is_read_as_it_was_written(tmp_path: Path, clean: RecordedData) -> None:
     file = tmp_path / "lag.parquet"
     parquet.write_table(pyarrow.table({"mode": ["auto"] * 600, **clean._asdict()}), file)
-    for column, expected in zip(logs.read(str(file)), clean, strict=True):
+    for column, expected in zip(recorded_data.read(str(file)), clean, strict=True):
         np.testing.assert_array_equal(column, expected)
 
 
@@ -58,7 +57,7 @@ def test_other_columns_any_order_and_a_byte_order_mark_do_no_harm(tmp_path: Path
     rows = "\n".join(f"{k % 7}, x, {k}, {k * 0.5}" for k in range(200))
     file = tmp_path / "log.csv"
     file.write_text(f"\ufeffy, mode, r_tilde, time\n{rows}\n\n", encoding="utf-8")
-    data = logs.read(file)
+    data = recorded_data.read(file)
     assert (data.time[2], data.r_tilde[2], data.y[2]) == (1.0, 2.0, 2.0)
 
 
@@ -92,29 +91,29 @@ def test_what_is_wrong_is_named_with_its_row(tmp_path: Path, text: str, words: l
     file = tmp_path / "log.csv"
     file.write_text(text)
     with pytest.raises(ValueError, match=re.escape(words[0])) as caught:
-        logs.read(file)
+        recorded_data.read(file)
     assert [word for word in [str(file), *words] if word not in str(caught.value)] == []
 
 
 def test_a_file_that_is_none_of_these_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"there is no recorded data .*none\.csv"):
-        logs.read(tmp_path / "none.csv")
+        recorded_data.read(tmp_path / "none.csv")
     with pytest.raises(ValueError, match=r"log\.xlsx is neither \.csv nor \.parquet"):
-        logs.read("log.xlsx")
+        recorded_data.read("log.xlsx")
     for name, words in (("log.parquet", "is no Parquet"), ("log.csv", "line 2 is no UTF-8")):
         (tmp_path / name).write_bytes(b"time,r_tilde,y\n\xff\xfe")
         with pytest.raises(ValueError, match=words):
-            logs.read(tmp_path / name)
+            recorded_data.read(tmp_path / name)
     parquet.write_table(pyarrow.table({"time": [0.0], "r_tilde": [None], "y": [1.0]}), tmp_path / "gap.parquet")
     with pytest.raises(ValueError, match="r_tilde in row 1 is None"):
-        logs.read(tmp_path / "gap.parquet")
+        recorded_data.read(tmp_path / "gap.parquet")
 
 
 def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "log.parquet").touch()
     with pytest.raises(ValueError, match=re.escape("pip install 'jaxouter[parquet]'")):
-        logs.read(tmp_path / "log.parquet")
+        recorded_data.read(tmp_path / "log.parquet")
 
 
 def step_of_lag(steps: int, K: float = 0.5, T: float = 0.3, d: float = 0.25) -> np.ndarray:
@@ -123,7 +122,7 @@ def step_of_lag(steps: int, K: float = 0.5, T: float = 0.3, d: float = 0.25) -> 
 
 
 def test_a_clean_log_gives_the_lag_exactly(clean: RecordedData) -> None:
-    models = logs.ensemble(clean)
+    models = recorded_data.ensemble(clean)
     assert (models.order, models.dead) == (2, 2)
     for model in (models.nominal, *models.members):
         assert linear_models.gain(model) == pytest.approx(0.5, abs=1e-5)
@@ -134,21 +133,21 @@ def test_a_clean_log_gives_the_lag_exactly(clean: RecordedData) -> None:
 
 def test_a_noisy_log_gives_it_within_what_the_ensemble_spreads(noisy: RecordedData) -> None:
     """The noise is 5 % of the standard deviation of y."""
-    models = logs.ensemble(noisy)
+    models = recorded_data.ensemble(noisy)
     gains = [linear_models.gain(model) for model in models.members]
     assert linear_models.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
     assert abs(models.dead - 2) <= 1
     assert 1e-4 < np.std(gains) < 0.01
     np.testing.assert_allclose(linear_models.step_response(models.nominal, 40), step_of_lag(40), atol=0.03)
     assert models.redrawn == 0
-    again = logs.ensemble(noisy)
+    again = recorded_data.ensemble(noisy)
     jax.tree.map(np.testing.assert_array_equal, again, models)
 
 
 def test_pitch_is_identified_from_its_log() -> None:
     plant, params = plants.make("pitch")
     data = recorded(plant, params, rows=2_000, redraw=0.03)
-    models = logs.ensemble(data, members=2)
+    models = recorded_data.ensemble(data, members=2)
     assert linear_models.gain(models.nominal) == pytest.approx(1 / 3, rel=0.01)
     assert models.dead == 5  # 0.5 s
     base = np.zeros(150)
@@ -159,18 +158,18 @@ def test_pitch_is_identified_from_its_log() -> None:
 @pytest.mark.parametrize(("dead", "rows"), [(70, 600), (90, 1_200)])
 def test_a_long_dead_time_is_found(dead: int, rows: int) -> None:
     data = recorded(*kinds.late(dead)(), rows=rows, noise=0.01)
-    models = logs.ensemble(data, members=2)
+    models = recorded_data.ensemble(data, members=2)
     assert models.dead == dead
     assert linear_models.gain(models.nominal) == pytest.approx(0.5, rel=0.02)
 
 
 def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_settle(tmp_path: Path) -> None:
     file = write(tmp_path / "late.csv", recorded(*kinds.late(90)(), rows=800))
-    plant, _ = logs.make("late", str(file))
+    plant, _ = recorded_data.make("late", str(file))
     assert plant.history == 90 + 2
     assert plant.episode_steps == 400
     slow = recorded(*kinds.kind([math.exp(-1 / 100)], [0.005])(), rows=900)
-    plant, _ = logs.make("slow", str(write(tmp_path / "slow.csv", slow)))
+    plant, _ = recorded_data.make("slow", str(write(tmp_path / "slow.csv", slow)))
     assert plant.episode_steps == 2 * 300  # 95 % of a step after three time constants
 
 
@@ -178,21 +177,21 @@ def test_the_plant_of_a_log_sees_past_the_dead_time_and_its_episodes_show_y_sett
 def test_all_commands_refuse_alike_what_does_not_settle(tmp_path: Path, plant: kinds.Maker, words: str) -> None:
     data = recorded(*plant(), rows=400)
     with pytest.raises(ValueError, match=words):
-        logs.ensemble(data)
+        recorded_data.ensemble(data)
     with pytest.raises(ValueError, match=words):  # `check` and `train` both make the plant, and see this alone
-        logs.make("log", str(write(tmp_path / "log.csv", data)))
+        recorded_data.make("log", str(write(tmp_path / "log.csv", data)))
 
 
 def test_what_cannot_be_validated_is_refused_before_it_is_a_plant(tmp_path: Path, clean: RecordedData) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(logs, "without_last_quarter", lambda *_: logs.ensemble(clean, members=1))
+        patch.setattr(logs, "without_last_quarter", lambda *_: recorded_data.ensemble(clean, members=1))
         with pytest.raises(ValueError, match="members is 1"):
-            logs.make("log", str(write(tmp_path / "log.csv", clean)))
+            recorded_data.make("log", str(write(tmp_path / "log.csv", clean)))
 
 
 def test_free_run_continues_from_what_was_recorded(clean: RecordedData) -> None:
-    models = logs.ensemble(clean, members=2)
-    np.testing.assert_allclose(logs.free_run(models.nominal, clean, 300, 250), clean.y[300:550], atol=1e-5)
+    models = recorded_data.ensemble(clean, members=2)
+    np.testing.assert_allclose(recorded_data.free_run(models.nominal, clean, 300, 250), clean.y[300:550], atol=1e-5)
 
 
 def test_what_never_comes_to_rest_is_refused() -> None:
@@ -200,12 +199,12 @@ def test_what_never_comes_to_rest_is_refused() -> None:
     r_tilde = np.repeat(rng.uniform(-1.0, 1.0, 30), 10)
     y = 1e-3 * np.exp(0.05 * np.arange(300)) + 0.1 * np.cumsum(r_tilde)
     with pytest.raises(ValueError, match="unstable"):
-        logs.ensemble(RecordedData(0.1 * np.arange(300), r_tilde, y))
+        recorded_data.ensemble(RecordedData(0.1 * np.arange(300), r_tilde, y))
 
 
 def test_too_few_members_are_refused(clean: RecordedData) -> None:
     with pytest.raises(ValueError, match="members is 1; it must be at least 2"):
-        logs.ensemble(clean, members=1)
+        recorded_data.ensemble(clean, members=1)
 
 
 @of_single_draws  # of other draws the models may agree by chance
@@ -213,11 +212,11 @@ def test_an_output_that_has_nothing_to_do_with_r_tilde_is_refused(tmp_path: Path
     noise = clean._replace(y=np.random.default_rng(0).standard_normal(600))
     file = write(tmp_path / "noise.csv", noise)
     with pytest.raises(ValueError, match="do not agree on any y"):
-        logs.make("log", str(file))
+        recorded_data.make("log", str(file))
 
 
 def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: RecordedData) -> None:
-    plant, params = logs.make("log", str(path))
+    plant, params = recorded_data.make("log", str(path))
     low, high = plant.r_tilde_bounds
     assert (low, high) == (noisy.r_tilde.min(), noisy.r_tilde.max())
     np.testing.assert_allclose(plant.setpoint_range, (0.5 * low, 0.5 * high), atol=0.1)
@@ -234,17 +233,17 @@ def test_the_plant_declares_what_the_log_has_seen(path: Path, noisy: RecordedDat
 
 def test_what_it_declares_can_be_overridden(path: Path) -> None:
     changes = dict(r_tilde_bounds=(-3.0, 3.0), setpoint_range=(-1.0, 0.5), episode_steps=77, y_unit="degC")
-    plant, _ = logs.make("log", str(path), PlantOptions(**changes))
+    plant, _ = recorded_data.make("log", str(path), PlantOptions(**changes))
     assert {name: getattr(plant, name) for name in changes} == changes
     assert plant.evaluation_range == (-1.0, 0.5)
-    narrower, _ = logs.make("log", str(path), PlantOptions(r_tilde_bounds=(-1.0, 1.0)))
+    narrower, _ = recorded_data.make("log", str(path), PlantOptions(r_tilde_bounds=(-1.0, 1.0)))
     np.testing.assert_allclose(narrower.setpoint_range, (-0.5, 0.5), atol=0.02)
     with pytest.raises(ValueError, match="recorded data tell their control step"):
-        logs.make("log", str(path), PlantOptions(control_step=1.0))
+        recorded_data.make("log", str(path), PlantOptions(control_step=1.0))
 
 
 def test_an_environment_draws_a_member_for_each_episode(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: logs.make("log", str(path)))
+    monkeypatch.setitem(plants.REGISTRY, "logged", lambda: recorded_data.make("log", str(path)))
     env, params = environment.make("logged")
     _, state = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, 40), params)
     found = np.asarray(state.plant_params.model.c)
@@ -256,12 +255,12 @@ def test_an_environment_draws_a_member_for_each_episode(path: Path, monkeypatch:
 
 def test_a_log_is_identified_once_until_it_changes(tmp_path: Path, clean: RecordedData) -> None:
     file = write(tmp_path / "lag.csv", clean)
-    (first, params), (second, _) = logs.make("log", str(file)), logs.make("log", str(file))
+    (first, params), (second, _) = recorded_data.make("log", str(file)), recorded_data.make("log", str(file))
     assert hash(first) == hash(second)
     assert first == second
-    assert logs.identified(file)[1] is logs.identified(file)[1]
+    assert recorded_data.identified(file)[1] is recorded_data.identified(file)[1]
     write(file, clean._replace(y=2.0 * clean.y))
-    assert float(logs.make("log", str(file))[1].model.b.sum()) == pytest.approx(
+    assert float(recorded_data.make("log", str(file))[1].model.b.sum()) == pytest.approx(
         2.0 * float(params.model.b.sum()), rel=1e-3
     )
 
@@ -270,5 +269,5 @@ def test_an_error_of_identification_names_the_file(tmp_path: Path) -> None:
     t = 0.1 * np.arange(300)
     file = write(tmp_path / "away.csv", RecordedData(t, np.sin(t), np.exp(0.05 * np.arange(300))))
     with pytest.raises(ValueError, match=r"away\.csv: the models of this record are unstable"):
-        logs.make("log", str(file))
-    assert math.isfinite(logs.read(file).step)
+        recorded_data.make("log", str(file))
+    assert math.isfinite(recorded_data.read(file).step)

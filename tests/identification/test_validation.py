@@ -14,7 +14,7 @@ from jaxouter.identification.recorded_data import RecordedData, ensemble
 from jaxouter.identification.validation import Validation
 from jaxouter.plants import simulate
 from tests import lag
-from tests.logs import recorded
+from tests.recorded import recorded
 
 
 def told(data: RecordedData) -> Validation:

@@ -14,7 +14,7 @@ from jaxouter.loop.policy import none
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.trainer import build
 from tests import lag
-from tests.logs import recorded, write
+from tests.recorded import recorded, write
 from tests.training.small import small
 
 START = PretrainingConfig(gradient_steps=100, batch_size=16)
