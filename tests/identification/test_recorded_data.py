@@ -184,7 +184,7 @@ def test_all_commands_refuse_alike_what_does_not_settle(tmp_path: Path, plant: k
 
 def test_what_cannot_be_validated_is_refused_before_it_is_a_plant(tmp_path: Path, clean: RecordedData) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(logs, "without_last_quarter", lambda *_: recorded_data.ensemble(clean, members=1))
+        patch.setattr(recorded_data, "without_last_quarter", lambda *_: recorded_data.ensemble(clean, members=1))
         with pytest.raises(ValueError, match="members is 1"):
             recorded_data.make("log", str(write(tmp_path / "log.csv", clean)))
 
