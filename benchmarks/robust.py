@@ -22,7 +22,7 @@ from jaxouter import cli
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.baselines import BASELINES, oracle
 from jaxouter.evaluation.metrics import held, mae
-from jaxouter.evaluation.policies import Named, baseline
+from jaxouter.evaluation.policies import NamedPolicy, baseline
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.training.run import Run, surroundings, write_json
@@ -31,18 +31,18 @@ RESULTS = Path(__file__).parent / "results"
 LEARNED, LIMIT = "learned", "its limit"
 
 
-def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
+def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[NamedPolicy]]]:
     """Name and policies: one for each seed of the runs, and one of all others."""
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
-    yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
+    yield LEARNED, [NamedPolicy(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
     limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
-    yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
+    yield LIMIT, [NamedPolicy(LIMIT, trainer.policy, oracle.learned(limit))]
     for name in BASELINES:
         yield name, [baseline(name, run.config.plant)]
 
 
-def evaluated(policies: Sequence[Named], scenario: Scenario) -> dict[str, Any]:
+def evaluated(policies: Sequence[NamedPolicy], scenario: Scenario) -> dict[str, Any]:
     """MAE and the share that is held, each the median over the seeds, with the worst seed."""
     traces = [rollout(named.policy, named.params, scenario) for named in policies]
     with np.errstate(all="ignore"):

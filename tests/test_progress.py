@@ -337,7 +337,7 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
             clock.now += 5
             report(f"{share:.0%} of it", share)
         said.append(of.line)
-        return evaluation.Named(name, None, ())
+        return evaluation.NamedPolicy(name, None, ())
 
     said = []
     monkeypatch.setattr(evaluate, "baseline", slow)
