@@ -31,7 +31,7 @@ from jaxouter.progress import Progress
 from jaxouter.training.run import add_agent, add_plant, open_run, own_agents, surroundings, write_json
 
 COLUMNS = ("policy", "run", "seed", "scenario", "mae", "ratio_to_limit", "ratio_to_bound", "within_limits")
-COLUMNS += ("worse_than_static", *FiguresOfMerit.__struct_encode_fields__[:-1])  # the others follow
+COLUMNS += ("worse_than_static", *FiguresOfMerit.__struct_encode_fields__[:-1])  # `diverged` only where it is
 OVERALL = 3  # figures of all scenarios: errors, effort, stability
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
@@ -64,6 +64,14 @@ class Options:
     """Print plants, presets, scenarios and policies, and end."""
 
 
+class Origin(NamedTuple):
+    """Where a policy comes from; all None unless from a run."""
+
+    run: str | None = None
+    seed: int | None = None
+    places: dict[str, str] | None = None  # of each scenario's plant among those of the training
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments), ExitStack() as stack:
@@ -88,10 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         selected = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
         results = evaluated(policies, selected, options.policy, progress)
     named = next(iter(policies.values()))
-    show(named.name, results, origin.get("places", {}))
+    show(named.name, results, origin.places or {})
     if options.json is not None:
         episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
-        found = result(named, results, **origin, family_seed=options.family_seed, episodes=episodes)
+        found = result(named, results, **origin._asdict(), family_seed=options.family_seed, episodes=episodes)
         write_json(options.json, msgspec.to_builtins(found))
         print(f"figures of merit: {options.json}")
     if options.traces is not None:
@@ -124,8 +132,8 @@ def check(options: Options) -> None:
         scenarios.builder(name)
 
 
-def choose(options: Options, progress: Progress) -> tuple[dict[str, NamedPolicy], dict[str, Any]]:
-    """The policy for each plant, and where it comes from (for the JSON).
+def choose(options: Options, progress: Progress) -> tuple[dict[str, NamedPolicy], Origin]:
+    """The policy for each plant, and where it comes from.
 
     Raises:
         ValueError: the folder is no run, or has no checkpoint.
@@ -134,15 +142,15 @@ def choose(options: Options, progress: Progress) -> tuple[dict[str, NamedPolicy]
         every = set(plants.REGISTRY) if options.plant is None else {options.plant}
         given = {name.split("/")[0] for name in options.scenario} or every
         names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
-        return {name: chosen(options.policy, name, progress) for name in names}, {}
+        return {name: chosen(options.policy, name, progress) for name in names}, Origin()
     assert options.run is not None  # as `check` found
     run, seed, _ = open_run(options.run)
     named = NamedPolicy("learned", *run.policy(seed))
-    origin: dict[str, Any] = {"run": str(run.path), "seed": seed}
+    places = None
     if run.config.randomise:
         selected = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
-        origin["places"] = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
-    return {run.config.plant: named}, origin
+        places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
+    return {run.config.plant: named}, Origin(str(run.path), seed, places)
 
 
 def chosen(policy: str, plant_name: str, progress: Progress) -> NamedPolicy:

@@ -364,7 +364,8 @@ def rows(done: Sequence[Done]) -> list[Row]:
     for d, figures in selected:
         c, on, mae, outside = d.job.entrant, d.job.on, figures.mae, figures.violation_time
         alone = over(mae, "none", on) if d.found.settings["stable_alone"] else None
-        others = asdict(figures) | {"improvement": None if alone is None else 100.0 * (1.0 - alone)}
+        others: dict[str, Any] = asdict(figures)
+        others["improvement"] = None if alone is None else 100.0 * (1.0 - alone)
         row = Row(
             policy=c.name,
             run=c.line[1],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,16 +131,15 @@ def location(samples: Sequence[np.ndarray]) -> Location:
     """
     if not samples:
         return Location()
-    found: dict[str, Any] = {}
     bounded = all(np.isfinite(sample).all() for sample in samples)
-    for name, centre in (("median", lambda x: np.median(x, axis=-1)), ("iqm", interquartile_mean)):
 
-        def mean(*strata: np.ndarray, centre: Callable[[np.ndarray], Any] = centre) -> Any:
+    def averaged(centre: Callable[[np.ndarray], Any]) -> tuple[float | None, Interval | None]:
+        def mean(*strata: np.ndarray) -> Any:
             return sum(centre(stratum) for stratum in strata) / len(strata)
 
-        found[name] = finite(mean(*samples))
-        found[f"{name}_interval"] = interval(mean, samples) if bounded else None
-    return Location(**found)
+        return finite(mean(*samples)), interval(mean, samples) if bounded else None
+
+    return Location(*averaged(partial(np.median, axis=-1)), *averaged(interquartile_mean))
 
 
 def improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Improvement:
