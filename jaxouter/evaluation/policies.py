@@ -18,14 +18,14 @@ from jaxouter.loop.policy import Policy, none
 from jaxouter.plants import Plant, host, make
 
 
-class Result(NamedTuple):
+class ScenarioResult(NamedTuple):
     """What a policy did on one scenario."""
 
     traces: Traces
     figures: FiguresOfMerit
 
 
-Results = dict[str, Result]  # by the scenario's id
+Results = dict[str, ScenarioResult]  # by the scenario's id
 
 
 class Evaluation(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -106,7 +106,7 @@ def evaluate(
         traces = rollout(named.policy, named.params, scenario, record_members)
         inner = traces if named.name == "none" else None if alone is None else alone[scenario.id].traces
         inner = rollout(*none(scenario.plant), scenario, record_members) if inner is None else inner
-        results[scenario.id] = Result(traces, figures_of_merit(traces, scenario, mae(inner)))
+        results[scenario.id] = ScenarioResult(traces, figures_of_merit(traces, scenario, mae(inner)))
         report(scenario)
     return results
 
