@@ -10,21 +10,22 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import tyro
 
 from jaxouter.evaluation import scenarios, statistics
+from jaxouter.evaluation.comparison import Comparison
 
 RESULTS = Path(__file__).parent / "results"
 
 
-def claims(content: Mapping[str, Any]) -> Iterator[list[str]]:
+def claims(content: Comparison) -> Iterator[list[str]]:
     """A line for each scenario that stands in the paper."""
-    lines = statistics.lines(content["rows"], content["policies"])
-    for name in scenarios.reported(content["plant"]):
+    lines = statistics.lines(content.rows, content.policies)
+    for name in scenarios.reported(content.plant):
         inner, drl = scenarios.get(name, 1).paper or (math.nan, math.nan)
         maes = {line.label: (line.median(name, "mae") or math.inf, line) for line in lines}
         best = min((label for label in maes if maes[label][1].kind == "baseline"), key=lambda label: maes[label][0])
@@ -43,14 +44,14 @@ def show(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 def main(folders: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     answers: list[list[str]] = []
     for folder in folders:
-        content = json.loads((folder / "comparison.json").read_text())
-        name = f"compare-{content['plant']}"
+        content = msgspec.convert(json.loads((folder / "comparison.json").read_text()), Comparison)
+        name = f"compare-{content.plant}"
         shutil.copy(folder / "comparison.csv", RESULTS / f"{name}.csv")
         for figure in (folder / "figures").glob("*.png"):
             if figure.stem in ("errors", "effort", "stability") or figure.stem.startswith("sweep-"):
                 shutil.copy(figure, RESULTS / f"{name}-{figure.name}")
-        columns, rows = statistics.table(content["rows"], content["policies"], "**{}**")
-        print(f"\n{content['plant']}, MAE in {content['y_unit']}; {content['date']}, {content['seconds']:.0f} s\n")
+        columns, rows = statistics.table(content.rows, content.policies, "**{}**")
+        print(f"\n{content.plant}, MAE in {content.y_unit}; {content.date}, {content.seconds:.0f} s\n")
         show(columns, rows)
         answers += claims(content)
     print("\nMAE, of that of the inner loop alone\n")

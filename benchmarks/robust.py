@@ -12,17 +12,18 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
 from statistics import median
-from typing import Any
 
+import msgspec
 import numpy as np
 import tyro
 from comparison import show
+from msgspec import Struct
 
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.baselines import BASELINES, oracle
 from jaxouter.evaluation.metrics import held, mae
-from jaxouter.evaluation.policies import Named, baseline
+from jaxouter.evaluation.policies import NamedPolicy, baseline
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.training.run import Run, surroundings, write_json
@@ -31,32 +32,41 @@ RESULTS = Path(__file__).parent / "results"
 LEARNED, LIMIT = "learned", "its limit"
 
 
-def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[Named]]]:
+def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[NamedPolicy]]]:
     """Name and policies: one for each seed of the runs, and one of all others."""
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
-    yield LEARNED, [Named(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
+    yield LEARNED, [NamedPolicy(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
     limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
-    yield LIMIT, [Named(LIMIT, trainer.policy, oracle.learned(limit))]
+    yield LIMIT, [NamedPolicy(LIMIT, trainer.policy, oracle.learned(limit))]
     for name in BASELINES:
         yield name, [baseline(name, run.config.plant)]
 
 
-def evaluated(policies: Sequence[Named], scenario: Scenario) -> dict[str, Any]:
-    """MAE and the share that is held, each the median over the seeds, with the worst seed."""
+class Held(Struct, frozen=True):
+    """MAE and the share that is held, each the median over the seeds, with the worst seed; None where diverged."""
+
+    mae: float | None
+    worst_mae: float | None
+    held: float
+    worst_held: float
+
+
+def evaluated(policies: Sequence[NamedPolicy], scenario: Scenario) -> Held:
+    """What the seeds of a policy hold on a scenario."""
     traces = [rollout(named.policy, named.params, scenario) for named in policies]
     with np.errstate(all="ignore"):
         maes, shares = [mae(t) for t in traces], [held(t, scenario.plant) for t in traces]
-    finite = [value if np.isfinite(value) else None for value in (median(maes), max(maes))]
-    return {"mae": finite[0], "worst_mae": finite[1], "held": median(shares), "worst_held": min(shares)}
+    middle, worst = (value if np.isfinite(value) else None for value in (median(maes), max(maes)))
+    return Held(middle, worst, median(shares), min(shares))
 
 
-def cell(row: dict[str, Any], limit: dict[str, Any]) -> str:
+def cell(row: Held, limit: Held) -> str:
     """MAE, its ratio to the limit, and the share that is held."""
-    if row["mae"] is None:
+    if row.mae is None:
         return "diverged"
-    ratio = "" if limit["mae"] is None or row is limit else f" ({row['mae'] / limit['mae']:.2f})"
-    return f"{row['mae']:.3g}{ratio}, {100 * row['held']:.0f} %"
+    ratio = "" if limit.mae is None or row is limit else f" ({row.mae / limit.mae:.2f})"
+    return f"{row.mae:.3g}{ratio}, {100 * row.held:.0f} %"
 
 
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
@@ -67,8 +77,8 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     plants = [scenarios.perturbed(name) for name in scenarios.for_stability(plant)]
     catalogue = [scenarios.get(name) for name in scenarios.catalogue(plant)]
     places = {s.id: scenarios.place(s, *opened[0].drawn) for s in catalogue}
-    started: dict[str, Any] = {}  # rows by policy and scenario
-    asked: dict[str, Any] = {}
+    started: dict[str, dict[str, Held]] = {}  # rows by policy and scenario
+    asked: dict[str, dict[str, Held]] = {}
     for name, policies in entrants(opened):
         print(name, flush=True)
         started[name] = {scenario.id: evaluated(policies, scenario) for scenario in plants}
@@ -80,13 +90,14 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         "seeds": [seed for run in opened for seed in run.seeds],
     }
     about |= {"preset": config.preset, "ranges": config.randomise, "places": places}
-    write_json(RESULTS / f"robust-{plant}.json", about | {"perturbed": started, "scenarios": asked})
+    found = msgspec.to_builtins({"perturbed": started, "scenarios": asked})
+    write_json(RESULTS / f"robust-{plant}.json", about | found)
 
     print(f"\n{plant}, {about['date']}: MAE (ratio to its limit), share held\n")
     rows = [[s.id, places[s.id], *(cell(row[s.id], started[LIMIT][s.id]) for row in started.values())] for s in plants]
     show(["plant", "of the drawn ones", *started], rows)
     print("\nMAE on all scenarios\n")
-    pairs = [(s.id, [asked[name][s.id]["mae"] for name in (LEARNED, LIMIT)]) for s in catalogue]
+    pairs = [(s.id, [asked[name][s.id].mae or np.inf for name in (LEARNED, LIMIT)]) for s in catalogue]
     rows = [[name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs]
     show(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows)
 

@@ -130,9 +130,8 @@ def main(
     for plant in plants:
         scenario = scenarios.get(scenarios.reported(plant)[0])
         found = curves(plant, runs)
-        static, limit = (
-            evaluate(baseline(name, plant), [scenario])[scenario.id][1]["mae"] for name in ("static", "oracle")
-        )
+        simple = [evaluate(baseline(name, plant), [scenario])[scenario.id] for name in ("static", "oracle")]
+        static, limit = (each.figures.mae or np.inf for each in simple)
         levels = {"static": static, f"{NEAR:g} x the limit": NEAR * limit, "limit": limit}
         rows: dict[str, Any] = {}
         for name, curve in found.items():

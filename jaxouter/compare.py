@@ -13,20 +13,25 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+import msgspec
 import tyro
+from msgspec.structs import replace
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import comparison_figures, jobs, pace, report, scenarios, statistics, sweeps
 from jaxouter.evaluation.baselines import BUDGET, SIMPLE
+from jaxouter.evaluation.comparison import Comparison
 from jaxouter.evaluation.jobs import Done, Entrant, Job
+from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.plants import Plant, host
 from jaxouter.plants.registry import REGISTRATIONS
 from jaxouter.progress import Progress
 from jaxouter.training.run import add_agent, add_plant, open_run, own_agents, surroundings, write_json
 
-FORMAT = 1
+COLUMNS = ("policy", "run", "seed", "scenario", "mae", "ratio_to_limit", "ratio_to_bound", "within_limits")
+COLUMNS += ("worse_than_static", *FiguresOfMerit.__struct_encode_fields__[:-1])  # `diverged` only where it is
 OVERALL = 3  # figures of all scenarios: errors, effort, stability
 
 
@@ -95,11 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 plan.out.rmdir()  # still empty, and its name is wanted again
                 raise
         progress.phase("statistics", 0)
-        content = assemble(plan, done)
-        content |= {
-            "seconds": time.perf_counter() - begun,
-            "command": shlex.join(["python", "-m", "jaxouter.compare", *arguments]),
-        }
+        content = assemble(plan, done, shlex.join(["python", "-m", "jaxouter.compare", *arguments]), begun)
         show(content)
         page = write(plan, content, done, progress)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {page}")
@@ -220,42 +221,50 @@ def work(plan: Plan, progress: Progress) -> list[Done]:
     return [done[job] for job in every]
 
 
-def assemble(plan: Plan, done: Sequence[Done]) -> dict[str, Any]:
-    """The content of comparison.json."""
+def assemble(plan: Plan, done: Sequence[Done], command: str, begun: float) -> Comparison:
+    """What the jobs gave, with its statistics.
+
+    Args:
+        plan, done: what was asked for, and all of it done.
+        command: of the user.
+        begun: when, of `time.perf_counter`.
+    """
     known = jobs.policies(plan.entrants, done)
     rows = statistics.ranks(jobs.rows(done), known)
     label = {(line.policy, line.run): line.label for line in statistics.lines(rows, known)}
     plant, _ = plants.make(plan.plant)
     swept = jobs.swept(done, plan.sweeps, label)
-    for sweep in swept.values():
-        sweep["best_baseline"] = statistics.best_baseline(sweep, known)
-    return {
-        "format": FORMAT,
-        "plant": plan.plant,
-        "y_unit": plant.y_unit,
-        "time_unit": plant.time_unit,
-        "family_seed": plan.family_seed,
-        "date": datetime.date.today().isoformat(),
-        "machine": surroundings(),
-        "policies": known,
-        "rows": rows,
-        "statistics": statistics.summarise(rows, known),
-        "sweeps": swept,
-        "stability": jobs.stabilities(done, label),
-    }
+    return Comparison(
+        plant=plan.plant,
+        y_unit=plant.y_unit,
+        time_unit=plant.time_unit,
+        family_seed=plan.family_seed,
+        date=datetime.date.today().isoformat(),
+        machine=surroundings(),
+        policies=known,
+        rows=rows,
+        statistics=statistics.summarise(rows, known),
+        sweeps={
+            name: replace(sweep, best_baseline=statistics.best_baseline(sweep, known)) for name, sweep in swept.items()
+        },
+        stability=jobs.stabilities(done, label),
+        seconds=time.perf_counter() - begun,
+        command=command,
+    )
 
 
-def write(plan: Plan, content: dict[str, Any], done: Sequence[Done], progress: Progress) -> Path:
+def write(plan: Plan, content: Comparison, done: Sequence[Done], progress: Progress) -> Path:
     """comparison.json, comparison.csv, figures and the report; returns the report's path."""
-    rows = content["rows"]
-    write_json(plan.out / "comparison.json", content)
+    values = msgspec.to_builtins(content, enc_hook=float)  # a user's settings may hold numbers of NumPy
+    write_json(plan.out / "comparison.json", values)
     with (plan.out / "comparison.csv").open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+        keys = (key for row in values["rows"] for key in row)
+        table = csv.DictWriter(file, list(dict.fromkeys([*COLUMNS, *keys])))
         table.writeheader()
-        table.writerows(rows)
+        table.writerows(values["rows"])
     figures: dict[str, Path] = {}
     responses: dict[str, Path] = {}
-    lines = statistics.lines(rows, content["policies"])
+    lines = statistics.lines(content.rows, content.policies)
     label = {(line.policy, line.run): line.label for line in lines}
     overall = OVERALL + len(plan.sweeps)
     progress.phase("drawing", overall + len(plan.scenarios))
@@ -272,11 +281,11 @@ def write(plan: Plan, content: dict[str, Any], done: Sequence[Done], progress: P
     return report.write(plan.out / "report.html", content, figures, responses)
 
 
-def show(content: dict[str, Any]) -> None:
+def show(content: Comparison) -> None:
     """Print MAE and ratio to the limit, the best of each scenario in bold."""
     best = "[bold]{}[/bold]" if cli.console.is_terminal else "{}*"
-    columns, rows = statistics.table(content["rows"], content["policies"], best)
-    cli.table(f"MAE, {content['y_unit']}", columns, rows)
+    columns, rows = statistics.table(content.rows, content.policies, best)
+    cli.table(f"MAE, {content.y_unit}", columns, rows)
     legend = {
         " (": "In brackets: ratio to the limit (oracle).",
         "[bold]": "Bold: best without the model.",

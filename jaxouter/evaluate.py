@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
+import msgspec
 import numpy as np
 import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import baselines, jobs, pace, scenarios
 from jaxouter.evaluation.baselines import BASELINES, CLAIRVOYANT
-from jaxouter.evaluation.policies import Named, Results, baseline, counter, evaluate, result, work
+from jaxouter.evaluation.policies import NamedPolicy, Results, baseline, counter, evaluate, result, work
 from jaxouter.progress import Progress
 from jaxouter.training.run import add_agent, add_plant, open_run, write_json
 
@@ -63,6 +64,14 @@ class Options:
     """Print plants, presets, scenarios and policies, and end."""
 
 
+class Origin(NamedTuple):
+    """Where a policy comes from; all None unless from a run."""
+
+    run: str | None = None
+    seed: int | None = None
+    places: dict[str, str] | None = None  # of each scenario's plant among those of the training
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments), ExitStack() as stack:
@@ -87,10 +96,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         selected = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
         results = evaluated(policies, selected, options.policy, progress)
     named = next(iter(policies.values()))
-    show(named.name, results, origin.get("places", {}))
+    show(named.name, results, origin.places or {})
     if options.json is not None:
         episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
-        write_json(options.json, result(named, results, **origin, family_seed=options.family_seed, episodes=episodes))
+        found = result(named, results, **origin._asdict(), family_seed=options.family_seed, episodes=episodes)
+        write_json(options.json, msgspec.to_builtins(found))
         print(f"figures of merit: {options.json}")
     if options.traces is not None:
         arrays = {f"{name}/{key}": getattr(t, key) for name, (t, _) in results.items() for key in ("r", "y", "r_tilde")}
@@ -122,8 +132,8 @@ def check(options: Options) -> None:
         scenarios.builder(name)
 
 
-def choose(options: Options, progress: Progress) -> tuple[dict[str, Named], dict[str, Any]]:
-    """The policy for each plant, and where it comes from (for the JSON).
+def choose(options: Options, progress: Progress) -> tuple[dict[str, NamedPolicy], Origin]:
+    """The policy for each plant, and where it comes from.
 
     Raises:
         ValueError: the folder is no run, or has no checkpoint.
@@ -132,18 +142,18 @@ def choose(options: Options, progress: Progress) -> tuple[dict[str, Named], dict
         every = set(plants.REGISTRY) if options.plant is None else {options.plant}
         given = {name.split("/")[0] for name in options.scenario} or every
         names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
-        return {name: chosen(options.policy, name, progress) for name in names}, {}
+        return {name: chosen(options.policy, name, progress) for name in names}, Origin()
     assert options.run is not None  # as `check` found
     run, seed, _ = open_run(options.run)
-    named = Named("learned", *run.policy(seed))
-    origin: dict[str, Any] = {"run": str(run.path), "seed": seed}
+    named = NamedPolicy("learned", *run.policy(seed))
+    places = None
     if run.config.randomise:
         selected = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
-        origin["places"] = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
-    return {run.config.plant: named}, origin
+        places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
+    return {run.config.plant: named}, Origin(str(run.path), seed, places)
 
 
-def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
+def chosen(policy: str, plant_name: str, progress: Progress) -> NamedPolicy:
     """The user's own policy, or a baseline, which is identified unless the cache has it; that is told.
 
     Raises:
@@ -151,7 +161,7 @@ def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
     """
     found = jobs.entrant(policy, plants.make(plant_name)[0])
     if found.kind == "user":
-        return Named(found.name, *jobs.load(found, plant_name))
+        return NamedPolicy(found.name, *jobs.load(found, plant_name))
 
     def heard(text: str, share: float) -> None:
         if not text:
@@ -166,7 +176,7 @@ def chosen(policy: str, plant_name: str, progress: Progress) -> Named:
 
 
 def evaluated(
-    policies: Mapping[str, Named], selected: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
+    policies: Mapping[str, NamedPolicy], selected: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
 ) -> Results:
     """The policy of each plant on its scenarios.
 
@@ -190,7 +200,7 @@ def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     """Print the table; with where each plant lies among those of the training, where that is known."""
     rows = [
         [name, *filter(None, [places.get(name)])]
-        + ["diverged" if figures.get("diverged") else cli.number(figures[key]) for key in SHOWN]
+        + ["diverged" if figures.diverged else cli.number(getattr(figures, key)) for key in SHOWN]
         for name, (_, figures) in results.items()
     ]
     columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
+import msgspec
 import numpy as np
 import tyro
 
@@ -24,7 +25,7 @@ from jaxouter import cli, plants
 from jaxouter.evaluation import figures, pace, scenarios
 from jaxouter.evaluation.baselines import SIMPLE
 from jaxouter.evaluation.metrics import mae
-from jaxouter.evaluation.policies import Named, Results, baseline, counter, evaluate, result
+from jaxouter.evaluation.policies import NamedPolicy, Results, TrainingSummary, baseline, counter, evaluate, result
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
 from jaxouter.plants import Plant
@@ -316,36 +317,36 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
     progress.phase("evaluating", total, counter=counter([selected[0].plant]))
     places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
     simple = {name: baseline(name, plant) for name in SIMPLE}
-    policies = {seed: Named("learned", trainer.policy, trainer.policy_params(state)) for seed, state in finals.items()}
+    of_seeds = {seed: trainer.policy_params(state) for seed, state in finals.items()}
+    policies = {seed: NamedPolicy("learned", trainer.policy, params) for seed, params in of_seeds.items()}
 
-    def evaluated(named: Named, alone: Results | None) -> Results:
+    def evaluated(named: NamedPolicy, alone: Results | None) -> Results:
         return evaluate(named, selected, True, alone, lambda scenario: progress.advance(scenario.r.size))
 
     alone = evaluated(simple["none"], None)
     simple_results = {name: alone if name == "none" else evaluated(named, alone) for name, named in simple.items()}
     learned = {seed: evaluated(named, alone) for seed, named in policies.items()}
-    by_mae = sorted(learned, key=lambda seed: learned[seed][selected[0].id][1]["mae"] or np.inf)
+    by_mae = sorted(learned, key=lambda seed: learned[seed][selected[0].id].figures.mae or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(run.config.seed), FRESH)
-    of_seeds = {seed: named.params for seed, named in policies.items()}
     affine = {name: named.params for name, named in simple.items()}
     verdict = judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine)
-    summary = {
-        "format": FORMAT,
-        "median_seed": median,
-        "training_seconds": seconds,
-        "steps": run.config.steps,
-        "identification_steps": run.config.identification_steps,
-        "updates": run.config.total_updates,
-        "places": places,
-        "episodes": {scenario.id: len(scenario.r) for scenario in selected},
-        "verdict": verdict,
-        "results": [result(policies[seed], results, seed=seed) for seed, results in learned.items()]
+    summary = TrainingSummary(
+        format=FORMAT,
+        median_seed=median,
+        training_seconds=seconds,
+        steps=run.config.steps,
+        identification_steps=run.config.identification_steps,
+        updates=run.config.total_updates,
+        places=places,
+        episodes={scenario.id: len(scenario.r) for scenario in selected},
+        verdict=verdict,
+        results=[result(policies[seed], results, seed=seed) for seed, results in learned.items()]
         + [result(simple[name], results) for name, results in simple_results.items()],
-    }
-    write_json(run.path / "summary.json", summary)
+    )
+    write_json(run.path / "summary.json", msgspec.to_builtins(summary))
     show(selected, simple_results, learned, places if run.config.randomise else {})
-    progress.print(verdict["text"])
+    progress.print(verdict.text)
     progress.phase("drawing", len(selected) + 2)
     main_figure = ""
     with cli.optional("figures"):
@@ -361,12 +362,15 @@ def draw(
     drawn: Callable[[], None],
 ) -> Path:
     """Write every figure, of each of which `drawn` hears; returns the main one."""
-    inner_traces, traces = ({name: t for name, (t, _) in results.items()} for results in (simple["none"], learned))
+    inner_traces, traces = (
+        {name: found.traces for name, found in results.items()} for results in (simple["none"], learned)
+    )
     for scenario in selected:
         name = scenario.id.replace("/", "-")
         figures.response(run.figures / f"{name}.png", scenario, inner_traces[scenario.id], traces[scenario.id])
         drawn()
-    levels = {name: results[selected[0].id][1]["mae"] for name, results in simple.items()}
+    maes = {name: results[selected[0].id].figures.mae for name, results in simple.items()}
+    levels = {name: value for name, value in maes.items() if value is not None}
     levels |= {"paper's DRL": selected[0].paper[1]} if selected[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
     title = f"{selected[0].id}, MAE [{selected[0].plant.y_unit}]"
@@ -385,14 +389,14 @@ def show(
     """Print the table; with several seeds the median, least and largest MAE; places and the paper's figures if any."""
     rows, of_paper = [], any(scenario.paper for scenario in selected)
     for scenario in selected:
-        of_seeds = [results[scenario.id][1] for results in learned.values()]
-        values = [figures["mae"] for figures in of_seeds if figures["mae"] is not None]
+        of_seeds = [results[scenario.id].figures for results in learned.values()]
+        values = [figures.mae for figures in of_seeds if figures.mae is not None]
         ours = cli.number(statistics.median(values)) if len(values) == len(of_seeds) else "diverged"
         if len(values) > 1:
             ours += f" ({cli.number(min(values))}-{cli.number(max(values))})"
-        better = [figures["improvement"] for figures in of_seeds if figures["improvement"] is not None]
+        better = [figures.improvement for figures in of_seeds if figures.improvement is not None]
         paper = "-" if scenario.paper is None else f"{scenario.paper[1]:.2f} of {scenario.paper[0]:.2f}"
-        inner, static = (simple[name][scenario.id][1]["mae"] for name in ("none", "static"))
+        inner, static = (simple[name][scenario.id].figures.mae for name in ("none", "static"))
         improvement = cli.number(statistics.median(better), 3) if better else "-"
         place = [places[scenario.id]] if places else []
         printed = [paper] if of_paper else []

@@ -23,7 +23,7 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.policies import Named, evaluate
+from jaxouter.evaluation.policies import NamedPolicy, evaluate
 from jaxouter.training.run import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
@@ -60,9 +60,9 @@ def line(name: str, run: Run) -> list[str]:
     """Variant, seeds, median MAE of each scenario, and seconds a seed, start included."""
     trainer, _ = run.trainer
     selected = [scenarios.get(identifier) for identifier in selected_on(run.config.plant)]
-    policies = [Named("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
+    policies = [NamedPolicy("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
     found = [evaluate(policy, selected) for policy in policies]
-    of_each = [[results[scenario.id][1]["mae"] for results in found] for scenario in selected]
+    of_each = [[results[scenario.id].figures.mae for results in found] for scenario in selected]
     seconds = (run.path / "seconds").read_text()
     return [name, str(run.config.seeds), *(f"{statistics.median(maes):.3f}" for maes in of_each), seconds]
 

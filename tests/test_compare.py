@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib
+import msgspec
 import pytest
 import tyro
 
 from jaxouter import cli, compare, evaluate
 from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
+from jaxouter.evaluation.comparison import Comparison
 from jaxouter.plants import REGISTRY
 from jaxouter.training.run import Run, write_json
 from tests import interrupts, lag
@@ -193,7 +195,8 @@ def test_where_nothing_can_be_drawn_all_else_is_written(compared, tmp_path, caps
         raise RuntimeError("no fonts")
 
     monkeypatch.setattr(compare.comparison_figures, "draw", draw)
-    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), compared.content, [], cli.progress())
+    content = msgspec.convert(compared.content, Comparison)
+    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), content, [], cli.progress())
     assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
     assert "outer loops compared" in page.read_text(encoding="utf-8")
     assert json.loads((tmp_path / "comparison.json").read_text()) == compared.content

@@ -15,6 +15,8 @@ from rich.console import Console
 from jaxouter import cli, compare, evaluate, progress, train
 from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.comparison import Comparison, PolicyInfo, Row, Summary
+from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.plants import REGISTRY, host
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset
@@ -258,31 +260,32 @@ def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
     assert of.line.startswith("learning  cost a step on the model 0.250  50 of 1,500 gradient steps")
 
 
-def made(mae, **other):
-    figures = {"mae": mae, "improvement": None, "diverged": False, **other}
-    return None, figures
-
-
 @pytest.mark.parametrize(("plant", "there"), [("pitch", True), ("lag", False)])
 def test_the_papers_column_is_for_its_plants_alone(plant, there, monkeypatch, capsys):
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     selected = [scenarios.get(name, 1) for name in scenarios.reported(plant)]
-    results = {scenario.id: made(1.0) for scenario in selected}
+    results = {scenario.id: evaluation.ScenarioResult(None, FiguresOfMerit(mae=1.0)) for scenario in selected}
     train.show(selected, {"none": results, "static": results}, {0: results}, {})
     assert ("paper's DRL" in capsys.readouterr().out) == there
 
 
+def comparison(*rows):
+    infos = {row.policy: PolicyInfo("baseline") for row in rows}
+    return Comparison(
+        plant="lag", y_unit="1", time_unit="s", family_seed=0, date="", machine={}, policies=infos, rows=list(rows),
+        statistics=Summary([], {}, {}), sweeps={}, stability=[], seconds=0.0, command="",
+    )  # fmt: skip
+
+
 def row(policy, mae, **other):
-    known = {"policy": policy, "run": None, "seed": None, "scenario": "lag/steps", "mae": mae}
-    return known | {"ratio_to_limit": None, "within_limits": True, "best": False, "diverged": False} | other
+    known = {"ratio_to_limit": None, "ratio_to_bound": None, "within_limits": True, "worse_than_static": None}
+    return Row(policy=policy, run=None, seed=None, scenario="lag/steps", mae=mae, **known | other)
 
 
 def test_comparison_explains_only_what_is_there(capsys):
-    policies = {"none": {"kind": "baseline"}, "static": {"kind": "baseline"}}
     legends = {"In brackets": "ratio_to_limit", "*: best": "best", "!: outside": "within_limits"}
     for changed in ({}, {"ratio_to_limit": 1.5}, {"best": True}, {"within_limits": False}):
-        rows = [row("none", 2.0), row("static", 1.0, **changed)]
-        compare.show({"rows": rows, "policies": policies, "y_unit": "1"})
+        compare.show(comparison(row("none", 2.0), row("static", 1.0, **changed)))
         out = capsys.readouterr().out
         assert [name for name in legends if name in out] == [n for n, key in legends.items() if key in changed]
 
@@ -290,8 +293,7 @@ def test_comparison_explains_only_what_is_there(capsys):
 def test_bold_is_explained_where_it_can_be_seen(monkeypatch, capsys):
     out = io.StringIO()
     monkeypatch.setattr(cli, "console", Console(file=out, force_terminal=True, width=80))
-    policies = {"none": {"kind": "baseline"}}
-    compare.show({"rows": [row("none", 2.0, best=True)], "policies": policies, "y_unit": "1"})
+    compare.show(comparison(row("none", 2.0, best=True)))
     assert capsys.readouterr().out == "Bold: best without the model.\n"
     assert "2*" not in STYLE.sub("", out.getvalue())
 
@@ -337,7 +339,7 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
             clock.now += 5
             report(f"{share:.0%} of it", share)
         said.append(of.line)
-        return evaluation.Named(name, None, ())
+        return evaluation.NamedPolicy(name, None, ())
 
     said = []
     monkeypatch.setattr(evaluate, "baseline", slow)

@@ -9,6 +9,7 @@ from unittest.mock import patch
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -59,7 +60,8 @@ def test_figures_of_merit_go_with_the_unit():
         r[0, :10] = 1e-8
         signals = (unit * signal for signal in (y0, r, y, 2.0 * r, -np.abs(r - y)))
         params, keys = lag.make(unit=unit)[1], jax.random.split(jax.random.key(0), 4)
-        return figures_of_merit(Traces(*signals, None, None, None), Scenario("lag/x", plant, params, r, keys))
+        scenario = Scenario("lag/x", plant, params, r, keys)
+        return msgspec.to_builtins(figures_of_merit(Traces(*signals, None, None, None), scenario))
 
     wanted = figures(1.0)
     assert wanted["violation_time"] == 0.0

@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxouter.evaluation.comparison import Comparison, StabilityRow, SweepErrors
 from jaxouter.evaluation.drawing import Axes, Figure, Line2D, LogNorm, SubFigure
 from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, symbol, times
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario, reported
-from jaxouter.evaluation.statistics import Line, lines, on_grid
+from jaxouter.evaluation.statistics import Line, lines, on_grid, scenarios
 from jaxouter.loop.references import FAMILIES
+from jaxouter.tasks import Axis
 
 
 class Style(NamedTuple):
@@ -65,10 +67,10 @@ def styles(names: Sequence[str]) -> dict[str, Style]:
     return found
 
 
-def _styles(comparison: Mapping[str, Any]) -> dict[str, Style]:
-    labels = [line.label for line in lines(comparison["rows"], comparison["policies"])]
-    others = [name for sweep in comparison["sweeps"].values() for name in sweep["policies"]]
-    return styles([*labels, *others, *(row["policy"] for row in comparison["stability"])])
+def _styles(comparison: Comparison) -> dict[str, Style]:
+    labels = [line.label for line in lines(comparison.rows, comparison.policies)]
+    others = [name for sweep in comparison.sweeps.values() for name in sweep.policies]
+    return styles([*labels, *others, *(row.policy for row in comparison.stability)])
 
 
 def _plain(name: str) -> str:
@@ -91,12 +93,12 @@ def _legend(figure: Figure, shown: Mapping[str, Style], lines_too: bool = True, 
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False, **kwargs)
 
 
-def errors(path: Path, comparison: Mapping[str, Any]) -> Path:
+def errors(path: Path, comparison: Comparison) -> Path:
     """MAE of every policy on every scenario as a multiple of the limit (without a limit: the MAE itself)."""
-    every = lines(comparison["rows"], comparison["policies"])
+    every = lines(comparison.rows, comparison.policies)
     look = _styles(comparison)
-    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
-    limited = any(row["ratio_to_limit"] is not None for row in comparison["rows"])
+    names = scenarios(comparison.rows)
+    limited = any(row.ratio_to_limit is not None for row in comparison.rows)
     key = "ratio_to_limit" if limited else "mae"
     every = [line for line in every if not (limited and line.kind == "limit")]  # 1 by definition
     figure = Figure(figsize=(9, 1.6 + 0.46 * len(names)), layout="constrained")
@@ -111,7 +113,7 @@ def errors(path: Path, comparison: Mapping[str, Any]) -> Path:
         axes.axvline(1.0, color="#111111", ls=DASHED, lw=1.2, zorder=2)
     axes.set_yticks(range(len(names)), [_short(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
-    unit = symbol(comparison["y_unit"])
+    unit = symbol(comparison.y_unit)
     axes.set_xlabel("MAE as a multiple of the limit's" if limited else f"MAE [{unit}]")
     hollow = Line2D([], [], color="#555555", marker="o", mfc="white", ls="", ms=6, label="hollow: outside the limits")
     limit = [Line2D([], [], color="#111111", ls=DASHED, lw=1.2, label="the limit")] if limited else []
@@ -141,18 +143,18 @@ def _dot(axes: Axes, line: Line, style: Style, scenario: str, key: str, height: 
     )
 
 
-def effort(path: Path, comparison: Mapping[str, Any]) -> Path:
+def effort(path: Path, comparison: Comparison) -> Path:
     """Total variation of r~ against MAE: a panel for each of the paper's scenarios, for the families and for the rest.
 
     Where a panel stands for several scenarios it shows geometric means over them.
     """
-    every, look = lines(comparison["rows"], comparison["policies"]), _styles(comparison)
+    every, look = lines(comparison.rows, comparison.policies), _styles(comparison)
     panels = _panels(comparison)
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.9 * columns, 3.5 * rows), layout="constrained")
     grid = np.ravel(figure.subplots(rows, columns, squeeze=False))
-    unit = symbol(comparison["y_unit"])
+    unit = symbol(comparison.y_unit)
     shown = []
     for axes, (title, names) in zip(grid, panels.items(), strict=False):
         points, missing = {}, []
@@ -188,11 +190,11 @@ def _mean_over(line: Line, names: Sequence[str], key: str) -> float | None:
     return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), 1e-9)))))
 
 
-def _panels(comparison: Mapping[str, Any]) -> dict[str, list[str]]:
+def _panels(comparison: Comparison) -> dict[str, list[str]]:
     """Scenarios of each panel, by title."""
-    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
+    names = scenarios(comparison.rows)
     families = [name for name in names if _short(name) in FAMILIES]
-    paper = [name for name in names if name in reported(comparison["plant"]) and name not in families]
+    paper = [name for name in names if name in reported(comparison.plant) and name not in families]
     rest = [name for name in names if name not in families + paper]
     panels = {_short(name): [name] for name in paper}
     for title, group in (("families", families), ("others", rest)):
@@ -242,10 +244,10 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> float:
     return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
 
 
-def sweep(path: Path, comparison: Mapping[str, Any], identifier: str) -> Path:
+def sweep(path: Path, comparison: Comparison, identifier: str) -> Path:
     """MAE over a swept parameter, relative to the policy's own nominal and to the best baseline there."""
-    content = comparison["sweeps"][identifier]
-    draw = _curves if len(content["axes"]) == 1 else _maps
+    content = comparison.sweeps[identifier]
+    draw = _curves if len(content.axes) == 1 else _maps
     return save(draw(content, _styles(comparison)), path)
 
 
@@ -256,37 +258,36 @@ class _Ratios(NamedTuple):
     baseline: np.ndarray | None
 
 
-def _ratios(content: Mapping[str, Any], name: str) -> _Ratios:
+def _ratios(content: SweepErrors, name: str) -> _Ratios:
     """Both ratios; nan where the policy diverged, infinite never. The nominal is the grid's point nearest to it."""
-    swept, best = content["policies"][name], content["best_baseline"]
-    values = np.array(swept["mae"], float)
+    swept, best = content.policies[name], content.best_baseline
+    values = swept.grid
     nearest = tuple(
-        int(np.argmin(np.abs(np.array(v) - axis["nominal"])))
-        for v, axis in zip(swept["values"], content["axes"], strict=True)
+        int(np.argmin(np.abs(np.array(v) - axis.nominal))) for v, axis in zip(swept.values, content.axes, strict=True)
     )
-    baseline = None if best is None else on_grid(swept, best["values"]) / np.array(best["mae"], float)
+    baseline = None if best is None else on_grid(swept, best.values) / best.grid
     return _Ratios(values / values[nearest], baseline)
 
 
-def _axis_label(axis: Mapping[str, Any]) -> str:
-    return axis["name"] if axis["unit"] in ("", "1") else f"{axis['name']} [{symbol(axis['unit'])}]"
+def _axis_label(axis: Axis) -> str:
+    return axis.name if axis.unit in ("", "1") else f"{axis.name} [{symbol(axis.unit)}]"
 
 
-def _curves(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
+def _curves(content: SweepErrors, look: Mapping[str, Style]) -> Figure:
     figure = Figure(figsize=(9.6, 4.6), layout="constrained")
-    axis, names = content["axes"][0], list(content["policies"])
+    axis, names = content.axes[0], list(content.policies)
     panels = [("relative to the policy's own nominal", 0), ("relative to the best baseline there", 1)]
     for axes, (title, which) in zip(figure.subplots(1, 2), panels, strict=True):
         lost = 0
         for name in names:
-            s, ratio = look[name], _ratios(content, name)[which]
-            if ratio is None:
+            s, swept, ratio = look[name], content.policies[name], _ratios(content, name)[which]
+            grid = swept if which == 0 else content.best_baseline
+            if ratio is None or grid is None:
                 continue
-            x = np.array((content["policies"][name] if which == 0 else content["best_baseline"])["values"][0], float)
+            x = np.array(grid.values[0], float)
             mark = max(1, len(x) // 8)
             axes.plot(x, ratio, color=s.color, ls=s.ls, lw=s.lw, zorder=s.zorder, marker=s.marker, ms=4, markevery=mark)
-            own = np.array(content["policies"][name]["values"][0], float)
-            gone = own[np.isnan(np.array(content["policies"][name]["mae"], float))]
+            gone = np.array(swept.values[0], float)[np.isnan(swept.grid)]
             if len(gone):
                 lost += 1
                 height = np.full(len(gone), 1.0 + 0.028 * lost)
@@ -294,13 +295,13 @@ def _curves(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
                     gone, height, "|", color=s.color, ms=4, mew=1.4, transform=axes.get_xaxis_transform(), clip_on=False
                 )
         axes.axhline(1.0, color="#555555", lw=0.8, zorder=1)
-        axes.axvline(axis["nominal"], color="#555555", lw=0.9, ls=DOTTED, zorder=1)
+        axes.axvline(axis.nominal, color="#555555", lw=0.9, ls=DOTTED, zorder=1)
         axes.annotate(
-            "nominal", (axis["nominal"], 0.97), xycoords=("data", "axes fraction"), xytext=(3, 0),
+            "nominal", (axis.nominal, 0.97), xycoords=("data", "axes fraction"), xytext=(3, 0),
             textcoords="offset points", fontsize=7.5, color="#555555",
         )  # fmt: skip
         log_axis(axes, "y")
-        if min(axis["values"]) > 0 and max(axis["values"]) > 100 * min(axis["values"]):
+        if min(axis.values) > 0 and max(axis.values) > 100 * min(axis.values):
             log_axis(axes, "x")
         axes.set_xlabel(_axis_label(axis))
         axes.set_ylabel("MAE ratio")
@@ -310,8 +311,8 @@ def _curves(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
     return figure
 
 
-def _maps(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
-    names = list(content["policies"])
+def _maps(content: SweepErrors, look: Mapping[str, Style]) -> Figure:
+    names = list(content.policies)
     ratios = {name: _ratios(content, name) for name in names}
     own = {name: found.own for name, found in ratios.items()}
     baseline = {name: found.baseline for name, found in ratios.items() if found.baseline is not None}
@@ -328,7 +329,7 @@ def _maps(content: Mapping[str, Any], look: Mapping[str, Style]) -> Figure:
 
 def _block(
     block: SubFigure,
-    content: Mapping[str, Any],
+    content: SweepErrors,
     ratios: Mapping[str, np.ndarray],
     look: Mapping[str, Style],
     columns: int,
@@ -345,8 +346,9 @@ def _block(
     for axes in np.ravel(grid)[len(ratios) :]:
         block.delaxes(axes)
     for i, (axes, (name, values)) in enumerate(zip(np.ravel(grid), ratios.items(), strict=False)):
-        source = content["policies"][name] if cmap == "cividis" else content["best_baseline"]
-        mesh = _map(axes, content, source["values"], values, LogNorm(bottom, top), cmap)
+        source = content.policies[name] if cmap == "cividis" else content.best_baseline
+        assert source is not None
+        mesh = _map(axes, content, source.values, values, LogNorm(bottom, top), cmap)
         axes.set_title(_plain(name), fontsize=9.5, loc="left", color=look[name].color, fontweight="bold")
         axes.tick_params(labelsize=8, labelbottom=i + columns >= len(ratios))
         if i == 0:
@@ -355,12 +357,12 @@ def _block(
             bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
             bar.ax.minorticks_off()
     block.suptitle(title, fontsize=11, x=0.01, ha="left")
-    block.supxlabel(_axis_label(content["axes"][1]), fontsize=9.5)
-    block.supylabel(_axis_label(content["axes"][0]), fontsize=9.5)
+    block.supxlabel(_axis_label(content.axes[1]), fontsize=9.5)
+    block.supylabel(_axis_label(content.axes[0]), fontsize=9.5)
 
 
 def _map(
-    axes: Axes, content: Mapping[str, Any], grid: Sequence[Sequence[float]], values: np.ndarray, norm: Any, cmap: str
+    axes: Axes, content: SweepErrors, grid: Sequence[Sequence[float]], values: np.ndarray, norm: Any, cmap: str
 ) -> Any:
     """One heat map; hatched grey where there is no value. The first axis goes up, the second to the right."""
     edges = [_edges(np.array(axis, float)) for axis in grid]
@@ -368,9 +370,9 @@ def _map(
     axes.patch.set_hatch("////")
     axes.patch.set_edgecolor("#a0a0a0")
     mesh = axes.pcolormesh(edges[1], edges[0], np.ma.masked_invalid(values), norm=norm, cmap=cmap, zorder=2)
-    swept = [axis["values"] for axis in content["axes"]]  # grids differ from policy to policy, frames must not
+    swept = [axis.values for axis in content.axes]  # grids differ from policy to policy, frames must not
     axes.set(xlim=(min(swept[1]), max(swept[1])), ylim=(min(swept[0]), max(swept[0])))
-    nominal = [axis["nominal"] for axis in content["axes"]]
+    nominal = [axis.nominal for axis in content.axes]
     axes.plot(nominal[1], nominal[0], marker="+", color="#d1701f", ms=10, mew=2, clip_on=False, zorder=5)
     return mesh
 
@@ -438,10 +440,10 @@ def _range(scenario: Scenario, traces: Mapping[str, Traces]) -> tuple[float, flo
     return float(shown.min() - margin), float(shown.max() + margin)
 
 
-def stability(path: Path, comparison: Mapping[str, Any]) -> Path:
+def stability(path: Path, comparison: Comparison) -> Path:
     """Spectral radius of the linearised closed loop over set-points, a panel a scenario; above 1 it is unstable."""
-    rows = [row for row in comparison["stability"] if row["spectral_radius"] is not None]
-    names, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("scenario", "policy"))
+    rows = [row for row in comparison.stability if row.spectral_radius is not None]
+    names, policies = list(dict.fromkeys(row.scenario for row in rows)), dict.fromkeys(row.policy for row in rows)
     look = _styles(comparison)
     columns = min(3, len(names))
     height = -(-len(names) // columns)
@@ -451,7 +453,7 @@ def stability(path: Path, comparison: Mapping[str, Any]) -> Path:
         figure.delaxes(axes)
     for i, (axes, name) in enumerate(zip(np.ravel(grid), names, strict=False)):
         for policy in policies:
-            own = [row for row in rows if (row["policy"], row["scenario"]) == (policy, name)]
+            own = [row for row in rows if (row.policy, row.scenario) == (policy, name)]
             if own:
                 _radii(axes, own, look[policy])
         low, high = axes.get_ylim()
@@ -461,7 +463,7 @@ def stability(path: Path, comparison: Mapping[str, Any]) -> Path:
         axes.set_ylim(low, high)
         axes.set_title(_short(name), fontsize=10, loc="left")
         if i + columns >= len(names):
-            axes.set_xlabel(f"set-point [{symbol(comparison['y_unit'])}]")
+            axes.set_xlabel(f"set-point [{symbol(comparison.y_unit)}]")
             axes.tick_params(labelbottom=True)
         if i % columns == 0:
             axes.set_ylabel("spectral radius")
@@ -470,20 +472,20 @@ def stability(path: Path, comparison: Mapping[str, Any]) -> Path:
     return save(figure, path)
 
 
-def _radii(axes: Axes, rows: Sequence[Mapping[str, Any]], style: Style) -> None:
-    x, radius = np.array(sorted((row["set_point"], row["spectral_radius"]) for row in rows)).T
+def _radii(axes: Axes, rows: Sequence[StabilityRow], style: Style) -> None:
+    x, radius = np.array(sorted((row.set_point, row.spectral_radius) for row in rows)).T
     axes.plot(x, radius, color=style.color, ls=style.ls, lw=style.lw, marker=style.marker, ms=4, zorder=style.zorder)
     bad = radius > 1
     mark: dict[str, Any] = dict(marker=style.marker, ls="", ms=5, mfc="white", mec=LIMIT, mew=1.3)
     axes.plot(x[bad], radius[bad], **mark, zorder=style.zorder + 0.1)
 
 
-def draw(folder: Path, comparison: Mapping[str, Any]) -> dict[str, Path]:
+def draw(folder: Path, comparison: Comparison) -> dict[str, Path]:
     """Every figure of a comparison but the time responses, by the id that the report knows it by."""
     found = {"errors": errors(folder / "errors.png", comparison), "effort": effort(folder / "effort.png", comparison)}
-    for identifier in comparison["sweeps"]:
+    for identifier in comparison.sweeps:
         path = folder / f"sweep-{_short(identifier).replace('/', '-')}.png"
         found[f"sweep {identifier}"] = sweep(path, comparison, identifier)
-    if any(row["spectral_radius"] is not None for row in comparison["stability"]):
+    if any(row.spectral_radius is not None for row in comparison.stability):
         found["stability"] = stability(folder / "stability.png", comparison)
     return found

@@ -20,17 +20,20 @@ from functools import lru_cache, partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
+import msgspec
 import numpy as np
+from msgspec.structs import asdict
 
 from jaxouter.evaluation import cache, scenarios, stability, sweeps
 from jaxouter.evaluation.baselines import CLAIRVOYANT, NAMES, OWN, Baseline, Kind, identified, resolve
 from jaxouter.evaluation.baselines.clairvoyant import Replay, plan
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.comparison import GridErrors, PolicyInfo, Row, StabilityRow, SweepErrors
+from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import Plant, make
@@ -65,9 +68,9 @@ class Entrant(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One piece of work; `what` is identify, meet, sweep or certify."""
+    """One piece of work."""
 
-    what: str
+    what: Literal["identify", "evaluate", "sweep", "stability"]
     entrant: Entrant
     plant: str
     on: str = ""  # scenario or sweep
@@ -161,7 +164,8 @@ def evaluate(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tu
         traces = rollout(*load(entrant, plant_name), scenario)
     arrays = {name: getattr(traces, name)[:1] for name in TRACES}
     arrays["mae"] = np.mean(np.abs(traces.r - traces.y), axis=1)
-    return Tuned(figures_of_merit(traces, scenario) | {"stable_alone": scenario.stable_alone}, arrays, 0)
+    figures = msgspec.to_builtins(figures_of_merit(traces, scenario))
+    return Tuned(figures | {"stable_alone": scenario.stable_alone}, arrays, 0)
 
 
 def sweep(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
@@ -180,7 +184,7 @@ def analyse(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tun
     params = jax.tree.map(lambda leaf: leaf[0], scenario.params)
     points = np.linspace(*scenario.plant.evaluation_range, SET_POINTS)
     rows = stability.analyse(*load(entrant, plant_name), scenario.plant, params, points.tolist())
-    return Tuned({"rows": [row._asdict() for row in rows]}, {}, 0)
+    return Tuned({"rows": msgspec.to_builtins(rows)}, {}, 0)
 
 
 def run(job: Job, report: Report = lambda text, share: None) -> Done:
@@ -327,62 +331,53 @@ def spread(
             raise
 
 
-def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, dict[str, Any]]:
+def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, PolicyInfo]:
     """What each policy is, and what its identification and tuning took."""
-    tuned = {d.job.entrant.name: d for d in done if d.job.what == "identify"}
-    found: dict[str, dict[str, Any]] = {}
-    for c in entrants:
-        known = {"kind": c.kind, "steps": None, "seconds": None, "settings": {}, "note": ""}
+    tuned = {d.job.entrant.name: d.found for d in done if d.job.what == "identify"}
+    paths = dict.fromkeys(Path(c.path or "") for c in entrants if c.kind == "learned")
+    configs = {path.name: Run.open(path).config for path in paths}
+
+    def about(c: Entrant) -> PolicyInfo:
         if c.kind == "learned":
-            paths = dict.fromkeys(other.path or "" for other in entrants if other.kind == "learned")
-            configs = {Path(path).name: Run.open(Path(path)).config for path in paths}
-            known |= {"steps": max(config.environment_steps for config in configs.values()), "note": LEARNED_NOTE}
-            known |= {"settings": {name: config.preset for name, config in configs.items()}}
-        elif c.kind == "preview":
-            known |= {"note": PREVIEW_NOTE}
-        elif c.kind == "user":
-            known |= {"note": f"{c.attribute} of {c.path}"}
-        else:
-            identification = tuned[c.name]
-            known |= {"steps": identification.found.steps, "seconds": identification.found.seconds}
-            known |= {"settings": identification.found.settings, "note": resolve(c.name).note}
-        found[c.name] = known
-    return found
+            steps = max(config.environment_steps for config in configs.values())
+            settings = {name: config.preset for name, config in configs.items()}
+            return PolicyInfo(c.kind, steps, settings=settings, note=LEARNED_NOTE)
+        if c.kind in ("preview", "user"):
+            return PolicyInfo(c.kind, note=PREVIEW_NOTE if c.kind == "preview" else f"{c.attribute} of {c.path}")
+        found = tuned[c.name]
+        return PolicyInfo(c.kind, found.steps, found.seconds, found.settings, resolve(c.name).note)
+
+    return {c.name: about(c) for c in entrants}
 
 
-def rows(done: Sequence[Done]) -> list[dict[str, Any]]:
-    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone.
-
-    `worse_than_static` is the share of the episodes in which its MAE is above that of `static`.
-    """
-    selected = [d for d in done if d.job.what == "evaluate"]
-    static = {d.job.on: d.found.arrays["mae"] for d in selected if d.job.entrant.name == "static"}
-    reference = {(d.job.entrant.name, d.job.on): d.found.settings["mae"] for d in selected}
+def rows(done: Sequence[Done]) -> list[Row]:
+    """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone."""
+    selected = [(d, msgspec.convert(d.found.settings, FiguresOfMerit)) for d in done if d.job.what == "evaluate"]
+    static = {d.job.on: d.found.arrays["mae"] for d, _ in selected if d.job.entrant.name == "static"}
+    reference = {(d.job.entrant.name, d.job.on): figures.mae for d, figures in selected}
 
     def over(mae: float | None, name: str, on: str) -> float | None:
         against = reference.get((name, on))
         return None if mae is None or not against else mae / against
 
     found = []
-    for d in selected:
-        figures, c, on = dict(d.found.settings), d.job.entrant, d.job.on
-        stable, outside = figures.pop("stable_alone"), figures["violation_time"]
-        mae, alone = figures["mae"], over(figures["mae"], "none", on)
-        figures["improvement"] = 100.0 * (1.0 - alone) if alone is not None and stable else None
-        worse = float(np.mean(~(d.found.arrays["mae"] <= static[on]))) if on in static else None
-        found.append(
-            {
-                "policy": c.name,
-                "run": c.line[1],
-                "seed": c.seed,
-                "scenario": on,
-                "mae": mae,
-            }
-            | {"ratio_to_limit": over(mae, "oracle", on), "ratio_to_bound": over(mae, CLAIRVOYANT, on)}
-            | {"within_limits": mae is not None and (outside is None or outside <= WITHIN)}
-            | {"worse_than_static": worse}
-            | figures
+    for d, figures in selected:
+        c, on, mae, outside = d.job.entrant, d.job.on, figures.mae, figures.violation_time
+        alone = over(mae, "none", on) if d.found.settings["stable_alone"] else None
+        others: dict[str, Any] = asdict(figures)
+        others["improvement"] = None if alone is None else 100.0 * (1.0 - alone)
+        row = Row(
+            policy=c.name,
+            run=c.line[1],
+            seed=c.seed,
+            scenario=on,
+            ratio_to_limit=over(mae, "oracle", on),
+            ratio_to_bound=over(mae, CLAIRVOYANT, on),
+            within_limits=mae is not None and (outside is None or outside <= WITHIN),
+            worse_than_static=float(np.mean(~(d.found.arrays["mae"] <= static[on]))) if on in static else None,
+            **others,
         )
+        found.append(row)
     return found
 
 
@@ -397,21 +392,21 @@ def first_episodes(done: Sequence[Done], on: str) -> dict[Entrant, Traces]:
     return dict(found.values())
 
 
-def swept(done: Sequence[Done], names: Sequence[str], label: Labels) -> dict[str, Any]:
-    """The sweeps as JSON values."""
-    found: dict[str, Any] = {}
+def swept(done: Sequence[Done], names: Sequence[str], label: Labels) -> dict[str, SweepErrors]:
+    """The sweeps under every policy, by name."""
+    found = {}
     for name in names:
-        axes = [axis.__dict__ | {"values": list(axis.values)} for axis in sweeps.get(name).axes]
         own = [d for d in done if d.job.what == "sweep" and d.job.on == name]
-        found[name] = {"axes": axes, "policies": {label[d.job.entrant.line]: d.found.settings for d in own}}
+        errors = {label[d.job.entrant.line]: GridErrors(**d.found.settings) for d in own}
+        found[name] = SweepErrors(sweeps.get(name).axes, errors)
     return found
 
 
-def stabilities(done: Sequence[Done], label: Labels) -> list[Mapping[str, Any]]:
-    """The stabilities as JSON values."""
-    certified = [d for d in done if d.job.what == "stability"]
+def stabilities(done: Sequence[Done], label: Labels) -> list[StabilityRow]:
+    """Local stability of every policy, scenario and set-point."""
+    analysed = [d for d in done if d.job.what == "stability"]
     return [
-        {"policy": label[d.job.entrant.line], "scenario": d.job.on, **row}
-        for d in certified
+        StabilityRow(policy=label[d.job.entrant.line], scenario=d.job.on, **row)
+        for d in analysed
         for row in d.found.settings["rows"]
     ]

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType, field
 
 from jaxouter.evaluation.rollout import Traces, excess
 from jaxouter.evaluation.scenarios import Scenario
@@ -15,6 +16,29 @@ from jaxouter.plants import Plant
 BAND = 0.05  # of the step, for the settling time
 ROUNDING = 1e-4  # of the error scale, by which a limit that is just met may be exceeded
 NO_STEP = 1e-6  # likewise, below which a set-point is where y already is
+
+
+class FiguresOfMerit(Struct, frozen=True, kw_only=True):
+    """Figures of merit of one policy on one scenario, with their units; None where not defined.
+
+    They are means over episodes, unless said. e_k is |r_k - y_(k+1)|, t the plant's unit of time.
+    """
+
+    mae: float | None = None  # y; mean of e
+    improvement: float | None = None  # %; of the MAE over the inner loop alone, where that is stable
+    iae: float | None = None  # y t; integral of e over an episode
+    ise: float | None = None  # y^2 t; integral of e^2 over an episode
+    itae: float | None = None  # y t^2; integral of t e over a set-point, t from its start
+    overshoot: float | None = None  # %; beyond the set-point, of the step; median over them: small steps give any value
+    settling_time: float | None = None  # t; until e stays within 5 % of the step, else infinite; median over set-points
+    steady_state_error: float | None = None  # y; |mean of r - y| over the last tenth of a set-point
+    violation_time: float | None = None  # share of steps outside the limits of y or of its change
+    violation_max: float | None = None  # y; largest excess over the limits
+    violation_time_each: float | None = None  # share; the same over the plant's single outputs (houses)
+    violation_max_each: float | None = None  # y; likewise
+    r_tilde_tv: float | None = None  # y; total variation of r~ in an episode
+    episode_return: float | None = field(default=None, name="return")  # sum of rewards in an episode
+    diverged: bool | UnsetType = UNSET  # only where a trace is not finite
 
 
 def significant(value: float, digits: int) -> str:
@@ -36,10 +60,8 @@ def held(traces: Traces, plant: Plant) -> float:
     return float(np.mean(np.all(late <= bound, axis=1)))
 
 
-def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None = None) -> dict[str, Any]:
-    """Every figure of merit of one policy on one scenario; None where it is not defined.
-
-    Over episodes the mean is taken, unless said.
+def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None = None) -> FiguresOfMerit:
+    """Every figure of merit of one policy on one scenario.
 
     Args:
         traces: of the policy.
@@ -47,48 +69,51 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
         inner_mae: MAE of the inner loop alone on the same scenario; without it `improvement` is None.
 
     Returns:
-        mae; improvement: of the MAE over the inner loop alone, %, where that is stable;
-        iae, ise: integrals of |e| and e^2 over an episode; itae: integral of t |e| over a set-point, t from its start;
-        overshoot: beyond the set-point, % of the step; settling_time: until |e| stays within 5 % of the step, where one
-        that never does counts as infinite; both the median over set-points, since small steps give any value;
-        steady_state_error: |mean of e| over the last tenth of a set-point;
-        violation_time: share of steps outside the limits; violation_max: largest excess;
-        violation_time_each, violation_max_each: the same over the plant's single outputs (houses);
-        r_tilde_tv: total variation of r~ in an episode; return: sum of rewards in an episode.
-        A trace that is not finite gives None throughout and `diverged: True`.
+        A trace that is not finite gives None throughout and `diverged`.
     """
-    names = ("mae", "improvement", "iae", "ise", "itae", "overshoot", "settling_time", "steady_state_error")
-    names += ("violation_time", "violation_max", "violation_time_each", "violation_max_each", "r_tilde_tv", "return")
     if not np.all(np.isfinite(traces.y)):
-        return dict.fromkeys(names) | {"diverged": True}
+        return FiguresOfMerit(diverged=True)
     plant, dt = scenario.plant, scenario.plant.control_step
     e = np.abs(traces.r - traces.y).astype(np.float64)
-    values: dict[str, Any] = dict.fromkeys(names)
-    values |= {"mae": float(e.mean()), "iae": float(e.sum(1).mean() * dt), "ise": float((e**2).sum(1).mean() * dt)}
-    if inner_mae is not None and scenario.stable_alone:
-        values["improvement"] = 100.0 * (1.0 - values["mae"] / inner_mae)
-    if scenario.segments:
-        segments = [_segment(y_start, r, y, dt, NO_STEP * plant.error_scale) for y_start, r, y in _segments(traces)]
-        itae, overshoot, settling, steady = (np.array(column) for column in zip(*segments, strict=True))
-        values["itae"], values["steady_state_error"] = float(itae.mean()), float(steady.mean())
-        steps = np.isfinite(overshoot)  # a set-point at which y already is has no step
-        if steps.any():
-            values["overshoot"] = float(np.median(overshoot[steps]))
-            median = float(np.median(settling[steps]))
-            values["settling_time"] = median if np.isfinite(median) else None
-    if plant.output_limit is not None or plant.rate_limit is not None:
-        over = np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
-        values["violation_time"], values["violation_max"] = (
-            float((over > ROUNDING * plant.error_scale).mean()),
-            float(max(0.0, over.max())),
-        )
-        if plant.members is not None:
-            values["violation_time_each"] = float(traces.each_outside.mean())
-            values["violation_max_each"] = float(max(0.0, traces.each_excess.max()))
+    mean = float(e.mean())
     before = np.clip(traces.y0, *plant.r_tilde_bounds)[:, None]
-    values["r_tilde_tv"] = float(np.abs(np.diff(traces.r_tilde, prepend=before, axis=1)).sum(1).mean())
-    values["return"] = float(traces.reward.sum(1).mean())
-    return values
+    return FiguresOfMerit(
+        mae=mean,
+        improvement=None if inner_mae is None or not scenario.stable_alone else 100.0 * (1.0 - mean / inner_mae),
+        iae=float(e.sum(1).mean() * dt),
+        ise=float((e**2).sum(1).mean() * dt),
+        r_tilde_tv=float(np.abs(np.diff(traces.r_tilde, prepend=before, axis=1)).sum(1).mean()),
+        episode_return=float(traces.reward.sum(1).mean()),
+        **(_of_set_points(traces, plant) if scenario.segments else {}),
+        **_violations(traces, plant),
+    )
+
+
+def _of_set_points(traces: Traces, plant: Plant) -> dict[str, Any]:
+    """Figures of the held set-points; a set-point at which y already is has no step."""
+    no_step = NO_STEP * plant.error_scale
+    segments = [_segment(y_start, r, y, plant.control_step, no_step) for y_start, r, y in _segments(traces)]
+    itae, overshoot, settling, steady = (np.array(column) for column in zip(*segments, strict=True))
+    found: dict[str, Any] = {"itae": float(itae.mean()), "steady_state_error": float(steady.mean())}
+    steps = np.isfinite(overshoot)
+    if steps.any():
+        median = float(np.median(settling[steps]))
+        found["overshoot"] = float(np.median(overshoot[steps]))
+        found["settling_time"] = median if np.isfinite(median) else None
+    return found
+
+
+def _violations(traces: Traces, plant: Plant) -> dict[str, Any]:
+    """Time and size outside the limits of y or of its change, where there are any."""
+    if plant.output_limit is None and plant.rate_limit is None:
+        return {}
+    over = np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
+    outside = over > ROUNDING * plant.error_scale
+    found = {"violation_time": float(outside.mean()), "violation_max": float(max(0.0, over.max()))}
+    if plant.members is not None:
+        found["violation_time_each"] = float(traces.each_outside.mean())
+        found["violation_max_each"] = float(max(0.0, traces.each_excess.max()))
+    return found
 
 
 def _segments(traces: Traces) -> Iterator[tuple[float, float, np.ndarray]]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
 
+from jaxouter.evaluation.comparison import Comparison, LineSummary, StabilityRow, Summary
 from jaxouter.evaluation.figures import symbol
 from jaxouter.evaluation.metrics import significant
-from jaxouter.evaluation.statistics import Line, lines
+from jaxouter.evaluation.statistics import Line, lines, scenarios
 
 KIND_NAMES = {
     "learned": "learned",
@@ -85,6 +86,22 @@ class TableLine(NamedTuple):
     mean_rank: float | None
 
 
+class Radius(NamedTuple):
+    """One field of the table of local stability."""
+
+    radius: float | None  # the largest over set-points
+    unstable: bool
+    notes: list[int]  # numbers of the notes, from 1
+
+
+class Radii(NamedTuple):
+    """The table of local stability."""
+
+    scenarios: list[str]
+    cells: dict[str, list[Radius]]  # by policy
+    notes: list[str]
+
+
 def merits(y_unit: str, time_unit: str) -> list[Merit]:
     """The figures of merit in the order in which the page shows and defines them."""
     y, t = symbol(y_unit), time_unit
@@ -103,7 +120,7 @@ def merits(y_unit: str, time_unit: str) -> list[Merit]:
         Merit("violation_time", "violation time", "share", "share of steps outside the limits of y or of its change"),
         Merit("violation_max", "largest violation", y, "largest excess over the limits"),
         Merit("r_tilde_tv", "variation of r̃", y, "sum of |r̃ₖ − r̃ₖ₋₁| over an episode, the first move included"),
-        Merit("return", "return", "", "sum of the rewards of an episode"),
+        Merit("episode_return", "return", "", "sum of the rewards of an episode"),
     ]
 
 
@@ -127,42 +144,41 @@ def short(scenario: str) -> str:
     return scenario.split("/", 1)[-1]
 
 
-def answer(comparison: Mapping[str, Any]) -> str:
-    """Two sentences: which policy is best, and how far from the limit it is."""
-    statistics, count = comparison["statistics"]["lines"], len({row["scenario"] for row in comparison["rows"]})
-    ranked = {label: line for label, line in statistics.items() if line["mean_rank"] is not None}
+def answer(summary: Summary, count: int) -> str:
+    """Two sentences: which policy is best on so many scenarios, and how far from the limit it is."""
+    ranked = {label: (line, line.mean_rank) for label, line in summary.lines.items() if line.mean_rank is not None}
     if not ranked:
         return "No policy was ranked. There is nothing to compare the limit with."
-    by_rank = sorted(ranked, key=lambda label: ranked[label]["mean_rank"])
-    learned = [label for label in by_rank if ranked[label]["kind"] == "learned"]
+    by_rank = sorted(ranked, key=lambda label: ranked[label][1])
+    learned = [label for label in by_rank if ranked[label][0].kind == "learned"]
     about = learned[0] if learned else by_rank[0]
     others = [label for label in by_rank if label not in (learned or [about])]
-    own, rank = ranked[about], figure(ranked[about]["mean_rank"])
-    place = f"the lowest MAE within the limits in {own['first']} of {_count(count, 'scenario')}, mean rank {rank}"
+    own, rank = ranked[about]
+    place = f"the lowest MAE within the limits in {own.first} of {_count(count, 'scenario')}, mean rank {figure(rank)}"
     if not others:
         first = f"{about} has {place}; nothing else was ranked"
     else:
-        other, theirs = others[0], ranked[others[0]]
-        better, equal = own["mean_rank"] < theirs["mean_rank"], own["mean_rank"] == theirs["mean_rank"]
+        other, (theirs, their_rank) = others[0], ranked[others[0]]
+        better, equal = rank < their_rank, rank == their_rank
         verdict = "is the best on the whole" if better else "shares the first place" if equal else "is not the best"
         which = "the next" if better else "its equal" if equal else "the best"
-        against = f"{other}, {which}: {theirs['first']}, mean rank {figure(theirs['mean_rank'])}"
+        against = f"{other}, {which}: {theirs.first}, mean rank {figure(their_rank)}"
         first = f"{about} {verdict}: {place} ({against})"
-    if own["unranked"]:
-        first += f"; it leaves the limits or diverges in {own['unranked']}"
+    if own.unranked:
+        first += f"; it leaves the limits or diverges in {own.unranked}"
     return f"{first}. {_distance(own)}"
 
 
-def _distance(line: Mapping[str, Any]) -> str:
+def _distance(line: LineSummary) -> str:
     """The sentence about the limit."""
-    ratios = {short(name): found["median"] for name, found in line["scenarios"].items() if found["median"] is not None}
+    ratios = {short(name): found.median for name, found in line.scenarios.items() if found.median is not None}
     if not ratios:
         return "How far it is from the limit is not known: the limit was not computed."
     least, most = min(ratios, key=ratios.__getitem__), max(ratios, key=ratios.__getitem__)
     if len(ratios) == 1:
         return f"Its MAE is {ratio(ratios[least])} the limit's ({least})."
     middle = ratio(float(np.median(list(ratios.values()))))
-    lost = f"; it diverged in {len(line['scenarios']) - len(ratios)}" if len(line["scenarios"]) > len(ratios) else ""
+    lost = f"; it diverged in {len(line.scenarios) - len(ratios)}" if len(line.scenarios) > len(ratios) else ""
     return (
         f"Its MAE is {middle} the limit's in the median scenario, from {ratio(ratios[least])} ({least}) "
         f"to {ratio(ratios[most])} ({most}){lost}."
@@ -173,17 +189,17 @@ def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" + "s" * (n != 1)
 
 
-def _table(comparison: Mapping[str, Any], every: list[Line]) -> list[list[TableLine]]:
+def _table(comparison: Comparison, every: list[Line]) -> list[list[TableLine]]:
     """The table of errors: learned and users' policies, baselines, and those that are not ranked."""
-    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
+    names = scenarios(comparison.rows)
     groups: list[list[TableLine]] = [[], [], []]
     for line in every:
-        found = comparison["statistics"]["lines"][line.label]
+        found = comparison.statistics.lines[line.label]
         remarks = {"limit": "the limit", "preview": "with preview"}
-        remark = remarks.get(line.kind, f"{found['seeds']} seeds" if found["seeds"] > 1 else "")
+        remark = remarks.get(line.kind, f"{found.seeds} seeds" if found.seeds > 1 else "")
         cells = [_cell(line, name) for name in names]
         where = {"learned": 0, "user": 0, "baseline": 1}.get(line.kind, 2)
-        groups[where].append(TableLine(line.label, line.kind, remark, cells, found["mean_rank"]))
+        groups[where].append(TableLine(line.label, line.kind, remark, cells, found.mean_rank))
     return groups
 
 
@@ -192,33 +208,31 @@ def _cell(line: Line, scenario: str) -> Cell:
     mae, limit = (line.median(scenario, key) for key in ("mae", "ratio_to_limit"))
     if mae is None:
         return Cell(None, None, False, "diverged" if rows else "", "")
-    outside, lost = sum(row["within_limits"] is False for row in rows), sum(bool(row.get("diverged")) for row in rows)
+    outside, lost = sum(not row.within_limits for row in rows), sum(bool(row.diverged) for row in rows)
     out = not line.within_limits(scenario)
     why = [
         f"{n} of {_count(len(rows), 'seed')} {what}"
         for n, what in ((outside, "outside the limits"), (lost, "diverged"))
     ]
-    best = any(row["best"] for row in rows)
+    best = any(row.best for row in rows)
     said = "; ".join(text for text, n in zip(why, (outside, lost), strict=True) if n)
     return Cell(mae, limit, out, "best" if best else "out" if out else "", said)
 
 
-def _radii(stability: list[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Largest spectral radius by policy and scenario, and numbered notes."""
+def _radii(stability: Sequence[StabilityRow]) -> Radii | None:
+    """The table of local stability; None where there is nothing to say."""
     if not stability:
         return None
-    policies, names = (list(dict.fromkeys(row[key] for row in stability)) for key in ("policy", "scenario"))
-    notes = list(dict.fromkeys(row["note"] for row in stability if row["note"]))
-    cells: dict[str, list[dict[str, Any]]] = {}
+    policies, names = dict.fromkeys(row.policy for row in stability), dict.fromkeys(row.scenario for row in stability)
+    notes = list(dict.fromkeys(row.note for row in stability if row.note))
+    cells: dict[str, list[Radius]] = {}
     for policy in policies:
         for name in names:
-            rows = [row for row in stability if (row["policy"], row["scenario"]) == (policy, name)]
-            radius = max((row["spectral_radius"] for row in rows if row["spectral_radius"] is not None), default=None)
-            own = sorted({notes.index(row["note"]) + 1 for row in rows if row["note"]})
-            cells.setdefault(policy, []).append(
-                {"radius": radius, "unstable": radius is not None and radius >= 1, "notes": own}
-            )
-    return {"scenarios": names, "cells": cells, "notes": notes}
+            rows = [row for row in stability if (row.policy, row.scenario) == (policy, name)]
+            largest = max((row.spectral_radius for row in rows if row.spectral_radius is not None), default=None)
+            own = sorted({notes.index(row.note) + 1 for row in rows if row.note})
+            cells.setdefault(policy, []).append(Radius(largest, largest is not None and largest >= 1, own))
+    return Radii(list(names), cells, notes)
 
 
 def _machine(machine: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -239,7 +253,7 @@ def _image(path: Path) -> Image:
     )
 
 
-def _contents(comparison: Mapping[str, Any], figures: Mapping[str, Path]) -> list[tuple[str, str]]:
+def _contents(comparison: Comparison, figures: Mapping[str, Path]) -> list[tuple[str, str]]:
     """Anchors and titles of the sections that are there."""
     sections = {
         "errors": "Errors",
@@ -247,7 +261,7 @@ def _contents(comparison: Mapping[str, Any], figures: Mapping[str, Path]) -> lis
         "responses": "Time responses",
         "effort": "Effort" if "effort" in figures else "",
         "sweeps": "Sweeps" if any(name.startswith("sweep ") for name in figures) else "",
-        "stability": "Stability" if comparison["stability"] else "",
+        "stability": "Stability" if comparison.stability else "",
         "policies": "Policies",
         "definitions": "Definitions",
         "made": "How this was made",
@@ -255,9 +269,7 @@ def _contents(comparison: Mapping[str, Any], figures: Mapping[str, Path]) -> lis
     return [(anchor, title) for anchor, title in sections.items() if title]
 
 
-def write(
-    path: Path, comparison: Mapping[str, Any], figures: Mapping[str, Path], responses: Mapping[str, Path]
-) -> Path:
+def write(path: Path, comparison: Comparison, figures: Mapping[str, Path], responses: Mapping[str, Path]) -> Path:
     """Write the page.
 
     Args:
@@ -277,28 +289,28 @@ def write(
         lstrip_blocks=True,
     )
     environment.filters |= {"figure": figure, "ratio": ratio, "short": short, "setting": setting}
-    every = lines(comparison["rows"], comparison["policies"])
-    names = list(dict.fromkeys(row["scenario"] for row in comparison["rows"]))
+    every = lines(comparison.rows, comparison.policies)
+    names = scenarios(comparison.rows)
     known = {name: figures.get(name) for name in ("errors", "effort", "stability")}
     page = environment.get_template("report.html.j2").render(
-        plant=comparison["plant"],
-        unit=symbol(comparison["y_unit"]),
-        date=comparison["date"],
-        seconds=comparison["seconds"],
-        family_seed=comparison["family_seed"],
-        command=comparison.get("command", f"python -m jaxouter.compare {comparison['plant']}"),
-        machine=_machine(comparison["machine"]),
-        policies=dict(sorted(comparison["policies"].items(), key=lambda item: list(KIND_NAMES).index(item[1]["kind"]))),
+        plant=comparison.plant,
+        unit=symbol(comparison.y_unit),
+        date=comparison.date,
+        seconds=comparison.seconds,
+        family_seed=comparison.family_seed,
+        command=comparison.command,
+        machine=_machine(comparison.machine),
+        policies=dict(sorted(comparison.policies.items(), key=lambda item: list(KIND_NAMES).index(item[1].kind))),
         kinds=KIND_NAMES,
-        statistics=comparison["statistics"],
-        answer=answer(comparison),
-        limited=bool(comparison["statistics"]["scenarios"]),
+        statistics=comparison.statistics,
+        answer=answer(comparison.statistics, len(names)),
+        limited=bool(comparison.statistics.scenarios),
         scenarios=names,
         lines=every,
         table=_table(comparison, every),
-        merits=merits(comparison["y_unit"], comparison["time_unit"]),
+        merits=merits(comparison.y_unit, comparison.time_unit),
         terms=TERMS,
-        radii=_radii(comparison["stability"]),
+        radii=_radii(comparison.stability),
         contents=_contents(comparison, figures),
         figures={name: _image(image) if image else None for name, image in known.items()},
         sweeps=[(key.removeprefix("sweep "), _image(png)) for key, png in figures.items() if key.startswith("sweep ")],

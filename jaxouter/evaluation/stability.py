@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from jax.flatten_util import ravel_pytree
+from msgspec import Struct
 from scipy.sparse.linalg import ArpackNoConvergence, eigs, splu
 
 from jaxouter.loop import closed_loop, rewards
@@ -35,7 +36,7 @@ HALVINGS = 8
 DENSE = 400  # variables up to which linear algebra is dense
 
 
-class LocalStability(NamedTuple):
+class LocalStability(Struct, frozen=True):
     """Local stability at one set-point; None where there is nothing to say."""
 
     set_point: float  # in the unit of y

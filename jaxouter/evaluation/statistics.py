@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
+from msgspec.structs import replace
+
+from jaxouter.evaluation.baselines import Kind
+from jaxouter.evaluation.comparison import (
+    BestBaseline,
+    GridErrors,
+    Improvement,
+    Interval,
+    LineSummary,
+    Location,
+    PolicyInfo,
+    Row,
+    Summary,
+    SweepErrors,
+)
 
 KINDS = ("learned", "user", "baseline", "limit", "preview")  # in the order in which they are shown
 RANKED = ("learned", "user", "baseline")  # the others know what no outer loop can know
 RESAMPLES = 9999
 
-Rows = Sequence[Mapping[str, Any]]
-Policies = Mapping[str, Mapping[str, Any]]
+Rows = Sequence[Row]
+Policies = Mapping[str, PolicyInfo]
 
 
 class Line(NamedTuple):
@@ -23,13 +39,13 @@ class Line(NamedTuple):
     label: str
     policy: str
     run: str | None
-    kind: str  # of KINDS
-    rows: dict[str, list[Mapping[str, Any]]]  # by scenario, one a seed
+    kind: Kind
+    rows: dict[str, list[Row]]  # by scenario, one a seed
 
     def values(self, scenario: str, key: str) -> np.ndarray:
         """Figure of merit `key` (seeds,): infinite where the policy diverged, nan where it is not defined."""
         rows = self.rows.get(scenario, [])
-        return np.array([np.inf if row.get("diverged") else row[key] for row in rows], float)
+        return np.array([np.inf if row.diverged else getattr(row, key) for row in rows], float)
 
     def median(self, scenario: str, key: str) -> float | None:
         """Median over seeds; None where it is not defined or the policy diverged."""
@@ -38,7 +54,7 @@ class Line(NamedTuple):
 
     def within_limits(self, scenario: str) -> bool:
         """Whether most of the seeds kept the limits."""
-        outside = [row["within_limits"] is False for row in self.rows.get(scenario, [])]
+        outside = [not row.within_limits for row in self.rows.get(scenario, [])]
         return 2 * sum(outside) < len(outside)
 
 
@@ -46,22 +62,22 @@ def lines(rows: Rows, policies: Policies) -> list[Line]:
     """The lines of a comparison, learned first; of several runs each is named by its folder."""
     runs: dict[str, list[str | None]] = {}
     for row in rows:
-        known = runs.setdefault(row["policy"], [])
-        known += [] if row["run"] in known else [row["run"]]
+        known = runs.setdefault(row.policy, [])
+        known += [] if row.run in known else [row.run]
     found = []
-    for policy in sorted(runs, key=lambda name: KINDS.index(policies[name]["kind"])):
+    for policy in sorted(runs, key=lambda name: KINDS.index(policies[name].kind)):
         folders = [run and Path(run).name for run in runs[policy]]
         for run, folder in zip(runs[policy], folders, strict=True):
             label = policy if len(folders) == 1 else f"{policy} {folder if folders.count(folder) == 1 else run}"
-            own = [row for row in rows if (row["policy"], row["run"]) == (policy, run)]
-            by_scenario = {name: [row for row in own if row["scenario"] == name] for name in scenarios(own)}
-            found.append(Line(label, policy, run, policies[policy]["kind"], by_scenario))
+            own = [row for row in rows if (row.policy, row.run) == (policy, run)]
+            by_scenario = {name: [row for row in own if row.scenario == name] for name in scenarios(own)}
+            found.append(Line(label, policy, run, policies[policy].kind, by_scenario))
     return found
 
 
 def scenarios(rows: Rows) -> list[str]:
     """Scenarios in the order of the rows."""
-    return list(dict.fromkeys(row["scenario"] for row in rows))
+    return list(dict.fromkeys(row.scenario for row in rows))
 
 
 def finite(value: Any) -> float | None:
@@ -74,7 +90,7 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
     return scipy.stats.trim_mean(values, 0.25, axis=-1)
 
 
-def interval(statistic: Callable[..., Any], samples: Sequence[np.ndarray]) -> list[float] | None:
+def interval(statistic: Callable[..., Any], samples: Sequence[np.ndarray]) -> Interval | None:
     """95 % bootstrap interval of a statistic, each sample resampled on its own.
 
     Args:
@@ -101,41 +117,36 @@ def interval(statistic: Callable[..., Any], samples: Sequence[np.ndarray]) -> li
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return [float(found.low), float(found.high)]
+    return float(found.low), float(found.high)
 
 
-def location(samples: Sequence[np.ndarray]) -> dict[str, Any]:
+def location(samples: Sequence[np.ndarray]) -> Location:
     """Median and interquartile mean over seeds, averaged over scenarios, with stratified bootstrap intervals.
 
     Args:
         samples: of each scenario (seeds,); infinite where a seed diverged.
 
     Returns:
-        median, iqm, median_interval, iqm_interval; None where there is no sample or the value is infinite, and the
-        intervals with one seed or where one of them diverged.
+        None where there is no sample or the value is infinite, and for intervals with one seed or where one diverged.
     """
     if not samples:
-        return dict.fromkeys(("median", "median_interval", "iqm", "iqm_interval"))
-    found: dict[str, Any] = {}
-    for name, centre in (("median", lambda x: np.median(x, axis=-1)), ("iqm", interquartile_mean)):
+        return Location()
+    bounded = all(np.isfinite(sample).all() for sample in samples)
 
-        def mean(*strata: np.ndarray, centre: Callable[[np.ndarray], Any] = centre) -> Any:
+    def averaged(centre: Callable[[np.ndarray], Any]) -> tuple[float | None, Interval | None]:
+        def mean(*strata: np.ndarray) -> Any:
             return sum(centre(stratum) for stratum in strata) / len(strata)
 
-        bounded = all(np.isfinite(sample).all() for sample in samples)
-        found[name] = finite(mean(*samples))
-        found[f"{name}_interval"] = interval(mean, samples) if bounded else None
-    return found
+        return finite(mean(*samples)), interval(mean, samples) if bounded else None
+
+    return Location(*averaged(partial(np.median, axis=-1)), *averaged(interquartile_mean))
 
 
-def improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> dict[str, Any]:
+def improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Improvement:
     """Probability that a seed of ours has a lower error than one of theirs: mean over scenarios, ties count half.
 
     Args:
         ours, theirs: errors of each scenario, (seeds,) and (seeds of the other,); infinite where diverged.
-
-    Returns:
-        probability, and its bootstrap interval (None where both have one seed).
 
     Source: Agarwal et al., Deep reinforcement learning at the edge of the statistical precipice, 2021, section 4.3.
     """
@@ -146,7 +157,7 @@ def improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> dic
         return sum(np.mean((x < y) + 0.5 * (x == y), axis=(-2, -1)) for x, y in pairs) / n
 
     samples = [*ours, *theirs]
-    return {"probability": float(probability(*samples)), "interval": interval(probability, samples)}
+    return Improvement(float(probability(*samples)), interval(probability, samples))
 
 
 def ranking(rows: Rows, policies: Policies) -> dict[str, dict[str, int]]:
@@ -164,54 +175,47 @@ def ranking(rows: Rows, policies: Policies) -> dict[str, dict[str, int]]:
     return table
 
 
-def ranks(rows: Rows, policies: Policies) -> list[dict[str, Any]]:
-    """The rows with `rank` (None where not ranked) and `best` filled in; all seeds of a line get its rank."""
+def ranks(rows: Rows, policies: Policies) -> list[Row]:
+    """The rows with `rank` and `best` filled in; all seeds of a line get its rank."""
     table = ranking(rows, policies)
     label = {(line.policy, line.run): line.label for line in lines(rows, policies)}
-    found = [table[row["scenario"]].get(label[row["policy"], row["run"]]) for row in rows]
-    return [{**row, "rank": rank, "best": rank == 1} for row, rank in zip(rows, found, strict=True)]
+    found = [table[row.scenario].get(label[row.policy, row.run]) for row in rows]
+    return [replace(row, rank=rank, best=rank == 1) for row, rank in zip(rows, found, strict=True)]
 
 
-def summarise(rows: Rows, policies: Policies) -> dict[str, Any]:
-    """Everything that is said over seeds, as JSON values.
-
-    Returns:
-        scenarios: those with a limit, over which `mean` is taken;
-        lines: by label: policy, run, kind, seeds, mean_rank (over all scenarios; without a rank it counts as the last),
-        first (scenarios in which it has rank 1), unranked (scenarios in which it has none), and of the MAE's ratio to
-        the limit `scenarios` (by id) and `mean`, each as `location` returns it (None where results are missing);
-        improvement: by label of a learned line and of each baseline or user's line, as `improvement` returns it.
-    """
+def summarise(rows: Rows, policies: Policies) -> Summary:
+    """Everything that is said over seeds."""
     every, table = lines(rows, policies), ranking(rows, policies).values()
-    limited = scenarios([row for row in rows if row["ratio_to_limit"] is not None])
+    limited = scenarios([row for row in rows if row.ratio_to_limit is not None])
     last = sum(line.kind in RANKED for line in every)
-    found: dict[str, Any] = {}
+    found = {}
     for line in every:
         ratios = {name: line.values(name, "ratio_to_limit") for name in limited if name in line.rows}
         own = [of_scenario.get(line.label) for of_scenario in table] if line.kind in RANKED else []
-        found[line.label] = {
-            "policy": line.policy,
-            "run": line.run,
-            "kind": line.kind,
-            "seeds": max(map(len, line.rows.values())),
-            "mean_rank": float(np.mean([rank or last for rank in own])) if own else None,
-            "first": own.count(1) if own else None,
-            "unranked": own.count(None) if own else None,
-            "scenarios": {name: location([sample]) for name, sample in ratios.items()},
-            "mean": location(list(ratios.values()) if len(ratios) == len(limited) else []),
-        }
-    return {"scenarios": limited, "lines": found, "improvement": _improvements(every)}
+        found[line.label] = LineSummary(
+            policy=line.policy,
+            run=line.run,
+            kind=line.kind,
+            seeds=max(map(len, line.rows.values())),
+            mean_rank=float(np.mean([rank or last for rank in own])) if own else None,
+            first=own.count(1) if own else None,
+            unranked=own.count(None) if own else None,
+            scenarios={name: location([sample]) for name, sample in ratios.items()},
+            mean=location(list(ratios.values()) if len(ratios) == len(limited) else []),
+        )
+    learned = [line for line in every if line.kind == "learned"]
+    others = [line for line in every if line.kind in ("baseline", "user")]
+    return Summary(limited, found, {line.label: _improvements(line, others) for line in learned})
 
 
-def _improvements(every: Sequence[Line]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for ours in (line for line in every if line.kind == "learned"):
-        found[ours.label] = {}
-        for theirs in (line for line in every if line.kind in ("baseline", "user")):
-            common = [name for name in ours.rows if name in theirs.rows]
-            if common:
-                samples = ([line.values(name, "mae") for name in common] for line in (ours, theirs))
-                found[ours.label][theirs.label] = improvement(*samples)
+def _improvements(ours: Line, others: Sequence[Line]) -> dict[str, Improvement]:
+    """Over each of the other lines, by label."""
+    found = {}
+    for theirs in others:
+        common = [name for name in ours.rows if name in theirs.rows]
+        if common:
+            samples = ([line.values(name, "mae") for name in common] for line in (ours, theirs))
+            found[theirs.label] = improvement(*samples)
     return found
 
 
@@ -233,48 +237,41 @@ def table(rows: Rows, policies: Policies, best: str) -> tuple[list[str], list[li
             mae, ratio = line.median(name, "mae"), line.median(name, "ratio_to_limit")
             text = "diverged" if mae is None else f"{mae:.3g}" + ("" if ratio is None else f" ({ratio:.2f})")
             text += "" if mae is None or line.within_limits(name) else "!"
-            cells.append(best.format(text) if any(row["best"] for row in line.rows.get(name, [])) else text)
+            cells.append(best.format(text) if any(row.best for row in line.rows.get(name, [])) else text)
         body.append(cells)
     return ["scenario", *(line.label for line in every)], body
 
 
-def on_grid(swept: Mapping[str, Any], values: Sequence[Sequence[float]]) -> np.ndarray:
+def on_grid(swept: GridErrors, values: Sequence[Sequence[float]]) -> np.ndarray:
     """MAE of one policy of a sweep at other values of the axes; nan where it diverged or did not run.
 
     Args:
-        swept: the policy's `values`, a list an axis, and `mae`, nested lists.
+        swept: of the policy, on its own grid.
         values: wanted, a list an axis.
     """
-    mae = np.array(swept["mae"], float)
+    mae = swept.grid
     out = np.full([len(axis) for axis in values], np.nan)
     for place in np.ndindex(*out.shape):
         hits = [
             np.flatnonzero(np.isclose(own, wanted[i], rtol=0, atol=1e-9))
-            for own, wanted, i in zip(swept["values"], values, place, strict=True)
+            for own, wanted, i in zip(swept.values, values, place, strict=True)
         ]
         if all(len(hit) for hit in hits):
             out[place] = mae[tuple(hit[0] for hit in hits)]
     return out
 
 
-def best_baseline(sweep: Mapping[str, Any], policies: Policies) -> dict[str, Any] | None:
-    """The least MAE of all baselines at each point of the grid that they have in common.
-
-    Returns:
-        values (a list an axis), mae and policy (nested lists, None where every baseline diverged); None without a
-        baseline or a common point.
-    """
+def best_baseline(sweep: SweepErrors, policies: Policies) -> BestBaseline | None:
+    """The least MAE of all baselines; None without a baseline or a point of the grid that they have in common."""
     baselines = {
-        name: swept
-        for name, swept in sweep["policies"].items()
-        if name in policies and policies[name]["kind"] == "baseline"
+        name: swept for name, swept in sweep.policies.items() if name in policies and policies[name].kind == "baseline"
     }
     if not baselines:
         return None
-    grids = [swept["values"] for swept in baselines.values()]
+    grids = [swept.values for swept in baselines.values()]
     values = [
         [v for v in grids[0][i] if all(np.isclose(grid[i], v, rtol=0, atol=1e-9).any() for grid in grids)]
-        for i in range(len(sweep["axes"]))
+        for i in range(len(sweep.axes))
     ]
     if not all(values):
         return None
@@ -283,4 +280,4 @@ def best_baseline(sweep: Mapping[str, Any], policies: Policies) -> dict[str, Any
     least = maes.min(0)
     policy = np.where(np.isfinite(least), np.array([*baselines], object)[maes.argmin(0)], np.array(None))
     mae = np.where(np.isfinite(least), least.astype(object), np.array(None))
-    return {"values": values, "mae": mae.tolist(), "policy": policy.tolist()}
+    return BestBaseline(values, mae.tolist(), policy.tolist())

@@ -10,6 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec import Struct
 
 from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
@@ -21,6 +22,15 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 ON_HOST = 4  # episodes of a plant that is simulated elsewhere, and may be slow
 
 
+class Verdict(Struct, frozen=True):
+    """The learned policies beside affine ones, on fresh training episodes."""
+
+    episodes: int
+    mae: dict[str, float | dict[str, float | None] | None]  # by name, `learned` by seed; None where diverged
+    worse: list[int]  # seeds that are not the best
+    text: str  # for people
+
+
 def judge(
     plant: Plant,
     params: Any,
@@ -28,7 +38,7 @@ def judge(
     policy: LearnedPolicy,
     learned: Mapping[int, LearnedParams],
     simple: Mapping[str, AffineParams],
-) -> dict[str, Any]:
+) -> Verdict:
     """MAE of the learned policies, by seed, and of affine ones, by name, on fresh training episodes.
 
     Args:
@@ -36,10 +46,6 @@ def judge(
         key: of the episodes, of which training has seen none.
         policy: of all seeds.
         learned, simple: what is compared.
-
-    Returns:
-        As JSON values: episodes; mae, by name and by seed, None where diverged; worse, seeds that are not the best;
-        text, for people.
     """
     count = EPISODES if plant.differentiable else ON_HOST
     idle = jax.tree.map(
@@ -55,13 +61,10 @@ def judge(
     of_seeds = {seed: of(each) for seed, each in learned.items()}
     best = min(found, key=lambda name: found[name])
     worse = [seed for seed, value in of_seeds.items() if not value <= found[best] or np.isinf(value)]
-    return {
-        "episodes": count,
-        "mae": {name: _json(value) for name, value in found.items()}
-        | {"learned": {str(seed): _json(value) for seed, value in of_seeds.items()}},
-        "worse": worse,
-        "text": _text(found, of_seeds, best, worse, count, plant.y_unit),
-    }
+    mae = {name: _finite(value) for name, value in found.items()}
+    by_seed = {str(seed): _finite(value) for seed, value in of_seeds.items()}
+    text = _text(found, of_seeds, best, worse, count, plant.y_unit)
+    return Verdict(count, {**mae, "learned": by_seed}, worse, text)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=RUN_ONCE)
@@ -72,7 +75,7 @@ def _mean_error(
     return jnp.mean(jnp.abs(episodes.r - outputs(policy, policy_params, episodes)))
 
 
-def _json(value: float) -> float | None:
+def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 

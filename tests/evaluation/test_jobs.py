@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 import jax
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from jaxouter.evaluation import cache, jobs, scenarios, sweeps
 from jaxouter.evaluation.baselines import BASELINES, identified
 from jaxouter.evaluation.baselines.clairvoyant import plan
 from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.comparison import GridErrors, Row, StabilityRow
 from jaxouter.evaluation.jobs import WITHIN, Done, Entrant, Job
 from jaxouter.evaluation.metrics import figures_of_merit
 from jaxouter.evaluation.rollout import rollout
@@ -150,8 +152,8 @@ def evaluated(entrant: Entrant, on: str, mae: float | None, outside: float | Non
     return Done(Job("evaluate", entrant, "pitch", on), Tuned(settings, arrays, 0), 0.5)
 
 
-def by_policy(done: list[Done]) -> dict[str, dict]:
-    return {row["policy"]: row for row in jobs.rows(done)}
+def by_policy(done: list[Done]) -> dict[str, Row]:
+    return {row.policy: row for row in jobs.rows(done)}
 
 
 def after(*arguments):
@@ -162,31 +164,31 @@ def after(*arguments):
 def test_rows_have_ratios_to_limit_and_bound_and_the_improvement_over_the_inner_loop():
     entrants = {LEARNED[0]: 3.0, LEARNED[1]: 6.0, NONE: 8.0, ORACLE: 2.0, CLAIRVOYANT: 1.5}
     rows = jobs.rows([evaluated(c, "pitch/paper", mae) for c, mae in entrants.items()])
-    assert [(row["policy"], row["run"], row["seed"], row["mae"]) for row in rows] == [
+    assert [(row.policy, row.run, row.seed, row.mae) for row in rows] == [
         ("learned", "runs/a", 1, 3.0),
         ("learned", "runs/a", 0, 6.0),
         ("none", None, None, 8.0),
         ("oracle", None, None, 2.0),
         ("clairvoyant", None, None, 1.5),
     ]
-    assert [row["ratio_to_limit"] for row in rows] == [1.5, 3.0, 4.0, 1.0, 0.75]
-    assert [row["ratio_to_bound"] for row in rows] == [2.0, 4.0, 8.0 / 1.5, 2.0 / 1.5, 1.0]
-    assert [row["improvement"] for row in rows] == [62.5, 25.0, 0.0, 75.0, 81.25]
-    assert {row["scenario"] for row in rows} == {"pitch/paper"}
-    assert all("stable_alone" not in row and row["return"] == -1.0 for row in rows)
+    assert [row.ratio_to_limit for row in rows] == [1.5, 3.0, 4.0, 1.0, 0.75]
+    assert [row.ratio_to_bound for row in rows] == [2.0, 4.0, 8.0 / 1.5, 2.0 / 1.5, 1.0]
+    assert [row.improvement for row in rows] == [62.5, 25.0, 0.0, 75.0, 81.25]
+    assert {row.scenario for row in rows} == {"pitch/paper"}
+    assert all(row.episode_return == -1.0 for row in rows)
 
 
 def test_rows_compare_within_a_scenario_only():
     done = [evaluated(c, on, mae) for on, mae in (("pitch/paper", 2.0), ("pitch/steps", 4.0)) for c in (NONE, ORACLE)]
     done += [evaluated(USER, "pitch/paper", 1.0), evaluated(USER, "pitch/steps", 1.0)]
-    assert [row["ratio_to_limit"] for row in jobs.rows(done)] == [1.0, 1.0, 1.0, 1.0, 0.5, 0.25]
+    assert [row.ratio_to_limit for row in jobs.rows(done)] == [1.0, 1.0, 1.0, 1.0, 0.5, 0.25]
 
 
 def test_no_ratio_without_what_it_relates_to():
     row = by_policy([evaluated(NONE, "pitch/paper", 8.0)])["none"]
-    assert (row["ratio_to_limit"], row["ratio_to_bound"], row["improvement"]) == (None, None, 0.0)
+    assert (row.ratio_to_limit, row.ratio_to_bound, row.improvement) == (None, None, 0.0)
     row = by_policy([evaluated(USER, "pitch/paper", 1.0)])[USER.name]
-    assert (row["run"], row["improvement"]) == (None, None)
+    assert (row.run, row.improvement) == (None, None)
 
 
 def test_improvement_means_nothing_where_the_inner_loop_is_unstable_but_ratios_do():
@@ -194,16 +196,16 @@ def test_improvement_means_nothing_where_the_inner_loop_is_unstable_but_ratios_d
         evaluated(c, "pitch/delay-5.7", mae, stable=False) for c, mae in ((NONE, 27.0), (STATIC, 9.0), (ORACLE, 3.0))
     ]
     row = by_policy(done)["static"]
-    assert (row["improvement"], row["ratio_to_limit"]) == (None, 3.0)
+    assert (row.improvement, row.ratio_to_limit) == (None, 3.0)
 
 
 def test_episodes_in_which_static_is_better_are_counted():
     done = [evaluated(c, "pitch/paper", mae) for c, mae in ((USER, 1.0), (STATIC, 2.0), (NONE, 3.0), (ORACLE, None))]
     done[0].found.arrays["mae"][1] = 2.5
-    assert {name: row["worse_than_static"] for name, row in by_policy(done).items()} == {
+    assert {name: row.worse_than_static for name, row in by_policy(done).items()} == {
         USER.name: 0.5, "static": 0.0, "none": 1.0, "oracle": 1.0
     }  # fmt: skip
-    assert by_policy(done[2:3])["none"]["worse_than_static"] is None
+    assert by_policy(done[2:3])["none"].worse_than_static is None
 
 
 def test_rows_of_what_diverged():
@@ -211,18 +213,18 @@ def test_rows_of_what_diverged():
     rows = by_policy(done)
     for name in ("none", "oracle", USER.name):
         row = rows[name]
-        assert row["diverged"] is True
-        assert row["within_limits"] is False
-        assert [row[key] for key in ("mae", "ratio_to_limit", "ratio_to_bound", "improvement")] == [None] * 4
-    assert "diverged" not in rows["static"]
-    assert [rows["static"][key] for key in ("mae", "ratio_to_limit", "improvement")] == [2.0, None, None]
+        assert row.diverged is True
+        assert row.within_limits is False
+        assert (row.mae, row.ratio_to_limit, row.ratio_to_bound, row.improvement) == (None,) * 4
+    assert not rows["static"].diverged
+    assert (rows["static"].mae, rows["static"].ratio_to_limit, rows["static"].improvement) == (2.0, None, None)
 
 
 @pytest.mark.parametrize(
     ("outside", "within"), [(0.0, True), (WITHIN, True), (1.01 * WITHIN, False), (1.0, False), (None, True)]
 )
 def test_limits_are_kept_up_to_a_thousandth_of_the_steps_or_where_there_are_none(outside, within):
-    assert by_policy([evaluated(NONE, "pitch/paper", 1.0, outside)])["none"]["within_limits"] is within
+    assert by_policy([evaluated(NONE, "pitch/paper", 1.0, outside)])["none"].within_limits is within
 
 
 ALL = (*LEARNED, OTHER_RUN, USER, NONE, STATIC, ORACLE, CLAIRVOYANT)
@@ -346,7 +348,7 @@ def test_users_policy_that_fails_is_named(own, name, text):
 def test_users_policy_whose_arithmetic_fails_has_diverged(own):
     done = jobs.run(Job("evaluate", own("GivesUp"), "lag", "lag/steps"))
     assert done.found.settings["diverged"] is True
-    assert by_policy([done])["own.py:GivesUp"]["within_limits"] is False
+    assert by_policy([done])["own.py:GivesUp"].within_limits is False
     swept = jobs.run(Job("sweep", own("GivesUp"), "pitch", "pitch/gain"))
     assert swept.found.settings["mae"] == [None] * 5  # the coarse grid of policies on the host
 
@@ -360,7 +362,7 @@ def test_meet_is_the_evaluation_of_the_policy(run):
         (seed, (trainer.policy, trainer.policy_params(run.load(1)[0]))),
     ):
         found, traces = jobs.evaluate(entrant, "lag", "lag/ramps", 3), rollout(*policy, scenario)
-        assert found.settings == figures_of_merit(traces, scenario) | {"stable_alone": True}
+        assert found.settings == msgspec.to_builtins(figures_of_merit(traces, scenario)) | {"stable_alone": True}
         assert found.arrays.keys() == {"y0", "r", "y", "r_tilde", "mae"}
         assert found.arrays["mae"].mean() == pytest.approx(found.settings["mae"], rel=1e-5)
         for name in jobs.TRACES:
@@ -388,7 +390,7 @@ def test_stability_goes_over_the_range_of_evaluation(own):
     rows = jobs.analyse(STATIC, "lag", "lag/steps", 2024).settings["rows"]
     assert [row["set_point"] for row in rows] == [-1.0, -0.5, 0.0, 0.5, 1.0]
     expected = analyse(*jobs.load(STATIC, "lag"), *lag.make(), [0.5])[0]
-    assert rows[3] == pytest.approx(expected._asdict())
+    assert rows[3] == pytest.approx(msgspec.to_builtins(expected))
     assert rows[3]["spectral_radius"] == pytest.approx(np.exp(-lag.CONTROL_STEP / 0.3), rel=1e-6)
     assert rows[3]["y"] == pytest.approx(0.5, abs=1e-3)
     notes = {row["note"] for row in jobs.analyse(own("Host"), "lag", "lag/steps", 2024).settings["rows"]}
@@ -499,15 +501,15 @@ def test_policies_say_what_they_are_and_what_they_took(run):
     ]
     known = jobs.policies(entrants, tuned)
     assert list(known) == ["learned", USER.name, "none", "static", "clairvoyant"]
-    assert {name: each["kind"] for name, each in known.items()} == {c.name: c.kind for c in entrants}
-    assert known["learned"]["steps"] == run.config.steps
-    assert known["learned"]["settings"] == {run.path.name: "default"}
-    assert known[USER.name]["note"] == "Twice of own.py"
-    assert (known["static"]["steps"], known["static"]["seconds"]) == (400, 2.5)
-    assert known["static"]["settings"] == identified("static", "lag").settings
+    assert {name: each.kind for name, each in known.items()} == {c.name: c.kind for c in entrants}
+    assert known["learned"].steps == run.config.steps
+    assert known["learned"].settings == {run.path.name: "default"}
+    assert known[USER.name].note == "Twice of own.py"
+    assert (known["static"].steps, known["static"].seconds) == (400, 2.5)
+    assert known["static"].settings == identified("static", "lag").settings
     for name in ("none", "static"):
-        assert known[name]["note"] == BASELINES[name].note
-    assert all(each["note"] for each in known.values())
+        assert known[name].note == BASELINES[name].note
+    assert all(each.note for each in known.values())
 
 
 def traced(entrant: Entrant, on: str, level: float) -> Done:
@@ -521,27 +523,28 @@ def test_first_episodes_are_of_the_first_seed_of_each_run():
     assert {c: float(traces.y[0, 0]) for c, traces in found.items()} == {LEARNED[0]: 0.0, OTHER_RUN: 2.0, NONE: 3.0}
 
 
-def test_sweeps_and_stabilities_as_json():
+def test_sweeps_and_stabilities_by_label():
     swept = {"values": [[0.5, 1.0, 1.5]], "mae": [1.0, None, 2.0]}
     done = [Done(Job("sweep", c, "pitch", "pitch/gain"), Tuned(swept, {}, 0), 0.1) for c in (STATIC, NONE)]
-    rows = [{"set_point": r, "spectral_radius": 0.9, "note": ""} for r in (0.0, 1.0)]
+    rows = [{"set_point": r, "y": r, "r_tilde": r, "spectral_radius": 0.9, "note": ""} for r in (0.0, 1.0)]
     done += [Done(Job("stability", NONE, "pitch", "pitch/paper"), Tuned({"rows": rows}, {}, 0), 0.1)]
     label = {c.line: c.name for c in (NONE, STATIC)}
     (gain,) = jobs.swept(done, ["pitch/gain"], label).values()
-    assert gain["policies"] == {"none": swept, "static": swept}
-    axis = sweeps.get("pitch/gain").axes[0]
-    assert gain["axes"] == [{"name": "gain", "unit": "1", "values": list(axis.values), "nominal": 1.0}]
-    assert jobs.stabilities(done, label) == [{"policy": "none", "scenario": "pitch/paper", **row} for row in rows]
+    assert gain.policies == {"none": GridErrors(**swept), "static": GridErrors(**swept)}
+    assert gain.axes == sweeps.get("pitch/gain").axes
+    assert jobs.stabilities(done, label) == [
+        StabilityRow(r, r, r, 0.9, "", policy="none", scenario="pitch/paper") for r in (0.0, 1.0)
+    ]
 
 
 def test_two_runs_keep_their_own_sweeps_and_stabilities():
     runs = {LEARNED[0]: 1.0, OTHER_RUN: 2.0}
-    rows = [{"set_point": 0.0, "spectral_radius": 0.9, "note": ""}]
+    rows = [{"set_point": 0.0, "y": 0.0, "r_tilde": 0.0, "spectral_radius": 0.9, "note": ""}]
     done = [
         Done(Job("sweep", c, "pitch", "pitch/gain"), Tuned({"values": [[1.0]], "mae": [mae]}, {}, 0), 0.1)
         for c, mae in runs.items()
     ] + [Done(Job("stability", c, "pitch", "pitch/paper"), Tuned({"rows": rows}, {}, 0), 0.1) for c in runs]
     label = {c.line: f"learned {c.path[-1]}" for c in runs}
-    swept = jobs.swept(done, ["pitch/gain"], label)["pitch/gain"]["policies"]
-    assert {name: each["mae"] for name, each in swept.items()} == {"learned a": [1.0], "learned b": [2.0]}
-    assert [row["policy"] for row in jobs.stabilities(done, label)] == ["learned a", "learned b"]
+    swept = jobs.swept(done, ["pitch/gain"], label)["pitch/gain"].policies
+    assert {name: each.mae for name, each in swept.items()} == {"learned a": [1.0], "learned b": [2.0]}
+    assert [row.policy for row in jobs.stabilities(done, label)] == ["learned a", "learned b"]

@@ -5,15 +5,30 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import pytest
+from msgspec.structs import asdict
 from playwright.sync_api import Page, sync_playwright
 
 from jaxouter.evaluation import comparison_figures, report, scenarios, statistics
-from jaxouter.evaluation.metrics import mae
-from jaxouter.evaluation.policies import Named, baseline, evaluate
+from jaxouter.evaluation.baselines import Kind
+from jaxouter.evaluation.comparison import (
+    Comparison,
+    GridErrors,
+    LineSummary,
+    Location,
+    PolicyInfo,
+    Row,
+    StabilityRow,
+    Summary,
+    SweepErrors,
+)
+from jaxouter.evaluation.metrics import FiguresOfMerit, mae
+from jaxouter.evaluation.policies import NamedPolicy, baseline, evaluate
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import steady_state
 from jaxouter.plants import make
+from jaxouter.tasks import Axis
 from jaxouter.training.run import surroundings
 from tests.precision import makes_nan
 
@@ -26,26 +41,21 @@ class Written(NamedTuple):
     """A report and what it was made of."""
 
     path: Path
-    comparison: dict
+    comparison: Comparison
 
 
-def policies() -> dict[str, Named]:
-    hostile = Named(HOSTILE, *steady_state.static(*make("pitch"), jax.random.key(1)))
+def policies() -> dict[str, NamedPolicy]:
+    hostile = NamedPolicy(HOSTILE, *steady_state.static(*make("pitch"), jax.random.key(1)))
     return {"none": baseline("none", "pitch"), "static": baseline("static", "pitch"), HOSTILE: hostile}
 
 
-def row(name: str, identifier: str, figures: dict, limit: float) -> dict:
-    ratio = figures["mae"] / limit
-    within = figures["violation_time"] <= 0.001
-    place = {"policy": name, "run": None, "seed": None, "scenario": identifier, "rank": None, "best": False}
-    return (
-        place
-        | figures
-        | {"ratio_to_limit": ratio, "ratio_to_bound": None, "worse_than_static": None, "within_limits": within}
-    )
+def row(name: str, identifier: str, figures: FiguresOfMerit, limit: float) -> Row:
+    assert figures.mae is not None
+    within = figures.violation_time is not None and figures.violation_time <= 0.001
+    return Row(name, None, None, identifier, figures.mae / limit, None, within, None, **asdict(figures))
 
 
-def swept(named: Named, axes: dict[str, list[float]]) -> dict:
+def swept(named: NamedPolicy, axes: dict[str, list[float]]) -> GridErrors:
     """MAE on pitch/paper over one or two parameters."""
     scenario = scenarios.get("pitch/paper", 1)
 
@@ -56,59 +66,60 @@ def swept(named: Named, axes: dict[str, list[float]]) -> dict:
 
     first, *rest = axes
     if not rest:
-        return {"values": [axes[first]], "mae": [error(**{first: v}) for v in axes[first]]}
+        return GridErrors([axes[first]], [error(**{first: v}) for v in axes[first]])
     grid = [[error(**{first: v, rest[0]: w}) for w in axes[rest[0]]] for v in axes[first]]
-    return {"values": list(axes.values()), "mae": grid}
+    return GridErrors(list(axes.values()), grid)
 
 
-def sweep(named: dict[str, Named], kinds: dict, axes: dict[str, list[float]], nominal: float) -> dict:
-    content = {
-        "axes": [{"name": name, "unit": "s", "values": values, "nominal": nominal} for name, values in axes.items()],
-        "policies": {name: swept(each, axes) for name, each in named.items()},
-    }
-    return content | {"best_baseline": statistics.best_baseline(content, kinds)}
+def sweep(
+    named: dict[str, NamedPolicy], infos: dict[str, PolicyInfo], axes: dict[str, list[float]], nominal: float
+) -> SweepErrors:
+    every = tuple(Axis(name, "s", tuple(values), nominal) for name, values in axes.items())
+    found = SweepErrors(every, {name: swept(each, axes) for name, each in named.items()})
+    return msgspec.structs.replace(found, best_baseline=statistics.best_baseline(found, infos))
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> Written:
     """Two scenarios, two sweeps, three policies, of which `static` stands in for the limit."""
     folder, named = tmp_path_factory.mktemp("report"), policies()
-    note = {"steps": 1600, "seconds": 0.1, "settings": {"name": HOSTILE, "gain": 3.0}, "note": f"{HOSTILE} & more."}
-    kinds = {"none": note | {"kind": "baseline"}, "static": note | {"kind": "limit"}, HOSTILE: note | {"kind": "user"}}
+    kinds: dict[str, Kind] = {"none": "baseline", "static": "limit", HOSTILE: "user"}
+    settings = {"name": HOSTILE, "gain": 3.0}
+    infos = {name: PolicyInfo(kind, 1600, 0.1, settings, f"{HOSTILE} & more.") for name, kind in kinds.items()}
     chosen = [scenarios.get(name, 2) for name in SCENARIOS]
     results = {name: evaluate(each, chosen) for name, each in named.items()}
-    limits = {identifier: figures["mae"] for identifier, (_, figures) in results["static"].items()}
+    limits = {identifier: found.figures.mae or 0.0 for identifier, found in results["static"].items()}
     rows = [
         row(name, identifier, figures, limits[identifier])
         for name, found in results.items()
         for identifier, (_, figures) in found.items()
     ]
     stability = [
-        {"policy": name, "scenario": "pitch/paper", "set_point": point, "spectral_radius": radius, "note": remark}
+        StabilityRow(point, None, None, radius, remark, policy=name, scenario="pitch/paper")
         for name, radius, remark in (("none", 0.99, ""), (HOSTILE, 1.01, HOSTILE))
         for point in (-5.0, 5.0)
     ]
-    content = {
-        "format": 1,
-        "plant": "pitch",
-        "y_unit": "crad",
-        "time_unit": "s",
-        "family_seed": 2024,
-        "seconds": 1.0,
-        "date": "2026-01-31",
-        "machine": surroundings(),
-        "policies": kinds,
-        "rows": statistics.ranks(rows, kinds),
-        "statistics": statistics.summarise(rows, kinds),
-        "sweeps": {
-            "pitch/pilot-delay": sweep(named, kinds, {"tau": [0.0, 0.5, 1.0]}, 0.5),
-            "pitch/controller-delays": sweep(named, kinds, {"d1": [0.0, 0.5], "d2": [0.0, 0.3, 0.6]}, 0.0),
+    content = Comparison(
+        plant="pitch",
+        y_unit="crad",
+        time_unit="s",
+        family_seed=2024,
+        date="2026-01-31",
+        machine=surroundings(),
+        policies=infos,
+        rows=statistics.ranks(rows, infos),
+        statistics=statistics.summarise(rows, infos),
+        sweeps={
+            "pitch/pilot-delay": sweep(named, infos, {"tau": [0.0, 0.5, 1.0]}, 0.5),
+            "pitch/controller-delays": sweep(named, infos, {"d1": [0.0, 0.5], "d2": [0.0, 0.3, 0.6]}, 0.0),
         },
-        "stability": stability,
-    }
+        stability=stability,
+        seconds=1.0,
+        command="python -m jaxouter.compare pitch",
+    )
     responses = {
         scenario.id: comparison_figures.responses(
-            folder / f"{i}.png", scenario, {name: results[name][scenario.id][0] for name in named}, list(named)
+            folder / f"{i}.png", scenario, {name: results[name][scenario.id].traces for name in named}, list(named)
         )
         for i, scenario in enumerate(chosen)
     }
@@ -152,7 +163,7 @@ def overflow(page: Page) -> int:
 
 def test_every_picture_is_seen(page, written):
     images = page.locator("img").all()
-    assert len(images) == 2 + len(written.comparison["sweeps"]) + 1 + 1  # errors, effort, sweeps, stability, response
+    assert len(images) == 2 + len(written.comparison.sweeps) + 1 + 1  # errors, effort, sweeps, stability, response
     for image in images:
         assert image.is_visible()
         assert image.evaluate("image => image.complete && image.naturalWidth") > 100
@@ -196,8 +207,8 @@ def test_hostile_names_stay_text(page):
 
 def test_errors_show_mae_or_ratio(page, written):
     cell = page.locator("section#errors tbody tr", has_text="none").locator("td").first
-    found = next(r for r in written.comparison["rows"] if (r["policy"], r["scenario"]) == ("none", "pitch/paper"))
-    mae, ratio = report.figure(found["mae"]), report.ratio(found["ratio_to_limit"])
+    found = next(r for r in written.comparison.rows if (r.policy, r.scenario) == ("none", "pitch/paper"))
+    mae, ratio = report.figure(found.mae), report.ratio(found.ratio_to_limit)
     assert mae == "10.9"
     assert cell.inner_text().split() == [mae, ratio]
     page.get_by_label("MAE", exact=True).check()
@@ -223,15 +234,15 @@ def test_page_is_one_file_in_both_colour_schemes(chromium, written):
 
 @makes_nan
 def test_answer_says_who_is_best_and_how_far_from_the_limit(written):
-    said = report.answer(written.comparison)
+    said = report.answer(written.comparison.statistics, 2)
     assert said.startswith(f"{HOSTILE} is the best on the whole: the lowest MAE within the limits in 2 of 2 scenarios")
     assert "(none, the next: 0, mean rank 2.00). Its MAE is " in said
     assert said.endswith(").")
 
 
 def line(kind, mean_rank, first, unranked=0, ratios=()):
-    found = {f"pitch/{i}": {"median": value} for i, value in enumerate(ratios)}
-    return {"kind": kind, "mean_rank": mean_rank, "first": first, "unranked": unranked, "scenarios": found}
+    found = {f"pitch/{i}": Location(value) for i, value in enumerate(ratios)}
+    return LineSummary("", None, kind, 1, mean_rank, first, unranked, found, Location())
 
 
 @pytest.mark.parametrize(
@@ -256,8 +267,7 @@ def line(kind, mean_rank, first, unranked=0, ratios=()):
     ],
 )
 def test_answer_in_every_case(lines, said):
-    rows = [{"scenario": f"pitch/{i}"} for i in range(4)]
-    assert report.answer({"rows": rows, "statistics": {"lines": lines}}) == said
+    assert report.answer(Summary([], lines, {}), 4) == said
 
 
 @pytest.mark.parametrize(

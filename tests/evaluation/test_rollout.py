@@ -111,7 +111,7 @@ def test_host_policy_that_fails_has_diverged(error, step):
     assert np.isfinite(traces.y[0, :step]).all()
     assert np.isnan(traces.y[0, step:]).all()
     assert np.isfinite(traces.y[1]).all()
-    assert figures_of_merit(traces, scenario)["diverged"]
+    assert figures_of_merit(traces, scenario).diverged
 
 
 def test_mistake_of_a_host_policy_is_not_hidden():

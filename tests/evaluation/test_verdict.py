@@ -8,10 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import pytest
 
 from jaxouter import export, plants
-from jaxouter.evaluation.verdict import judge
+from jaxouter.evaluation.verdict import Verdict, judge
 from jaxouter.loop.policy import AffineParams
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import Run
@@ -34,7 +35,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(3))
 
 
-def judged(**slopes: float) -> dict[str, Any]:
+def judged(**slopes: float) -> Verdict:
     """The verdict on policies by seed whose network does nothing; with a DC gain of 0.5 a slope of 2 is right."""
     policy = build(small("kind"))[0].policy
     idle = jax.tree.map(jnp.zeros_like, jax.eval_shape(policy.init_actor, jax.random.key(0)))
@@ -44,23 +45,24 @@ def judged(**slopes: float) -> dict[str, Any]:
 
 def test_the_best_is_said_to_be() -> None:
     found = judged(s0=2.0)
-    assert found["worse"] == []
-    assert found["mae"]["learned"]["0"] == found["mae"]["static"] < found["mae"]["none"]
-    assert found["text"].startswith("verdict: on 16 fresh training episodes what was learned is the best; MAE: learned")
+    assert found.worse == []
+    mae: Any = found.mae
+    assert mae["learned"]["0"] == mae["static"] < mae["none"]
+    assert found.text.startswith("verdict: on 16 fresh training episodes what was learned is the best; MAE: learned")
 
 
 def test_what_is_worse_than_doing_nothing_is_named_by_seed() -> None:
     found = judged(s3=2.0, s4=-1.0)
-    assert found["worse"] == [4]
-    assert "what was learned by seed 4 is worse than static; MAE: learned" in found["text"]
-    assert "export asks for --force" in found["text"]
-    json.dumps(found, allow_nan=False)
+    assert found.worse == [4]
+    assert "what was learned by seed 4 is worse than static; MAE: learned" in found.text
+    assert "export asks for --force" in found.text
+    json.dumps(msgspec.to_builtins(found), allow_nan=False)
 
 
 def test_what_diverges_is_worse() -> None:
     found = judged(s0=float("nan"))
-    assert (found["worse"], found["mae"]["learned"]["0"]) == ([0], None)
-    assert "learned diverged" in found["text"]
+    assert (found.worse, found.mae["learned"]) == ([0], {"0": None})
+    assert "learned diverged" in found.text
 
 
 @pytest.fixture
