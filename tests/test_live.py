@@ -148,7 +148,7 @@ def test_a_module_that_is_importable_is_named_without_py(trained, tmp_path, monk
         ([EXAMPLE, "--run", "x", "--dt", "nan"], "--dt is nan"),
         ([EXAMPLE, "--run", "x", "--dt", "1", "--steps", "0"], "--steps is 0; it must be at least 1"),
         ([EXAMPLE, "--run", "x", "--dt", "1"], "there is no run x; train one, or begin one from nothing by --learn"),
-        ([EXAMPLE, "--run", "x", "--dt", "1", "--learn"], "takes --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"),
+        ([EXAMPLE, "--run", "x", "--dt", "1", "--learn"], "needs --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--setpoint-range", "6", "2"], "--setpoint-range is (6.0, 2.0)"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--reference", "zigzag"], "--reference is 'zigzag'; it must be a number"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--reference", "no.csv"], "--reference: no.csv can't be read: No such file"),
