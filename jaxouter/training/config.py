@@ -40,8 +40,8 @@ class PretrainingConfig:
     load: float = 0.0
     """Largest load (unseen step added to r~ at a random time), which half of these have; 1 is half the r~ range."""
     log_above: float = 0.0
-    """c > 0: an episode's cost per step counts as c log(1 + cost / c), so that episodes on plants that are hard to
-    control don't outweigh all others; 0: it counts in full."""
+    """c > 0: an episode's cost per step counts as c log(1 + cost / c); 0: it counts in full.
+    This way episodes on plants that are hard to control don't outweigh all others."""
 
     def check(self) -> None:
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
@@ -64,15 +64,14 @@ class TrainConfig:
     preset: str
     """Preset that supplies the defaults: default, paper; for pitch and heaters also robust."""
     agent: AgentConfig
-    """Learning algorithm; --agent NAME chooses another."""
+    """Settings of the learning algorithm; --agent NAME chooses another."""
     seed: int = 0
     """Seed of the first run."""
     seeds: int = 1
     """Number of runs, with consecutive seeds, trained in parallel."""
     devices: int = 1
-    """Devices over all processes. The seeds are split over them. With more devices than seeds, each learner spans
-    several, which share its environments, replay and batches; results then differ from those of one device. The devices
-    of a process also share the episodes of pretraining, without changing its random numbers."""
+    """Devices over all processes, which share the seeds and the episodes of pretraining.
+    With more devices than seeds, several share each learner: its results then differ from those of one device."""
     steps: int = 200_000
     """Environment steps of the agent, over all environments, prefill included; 0: pretraining only."""
     environments: int = 1
@@ -96,7 +95,7 @@ class TrainConfig:
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
     """What a plant gym:ID, fmu:FILE or log:FILE does not declare itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
-    """Pretraining."""
+    """Pretraining of the actor on a model identified from recorded episodes."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
