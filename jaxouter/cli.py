@@ -127,7 +127,7 @@ def show(message: Warning | str, *_: object) -> None:
 
 @functools.cache
 def _not_kept(folder: str) -> None:
-    print(f"warning: {folder} can't be written: functions are compiled anew at the next start", file=sys.stderr)
+    print(f"warning: {folder} can't be written: functions are compiled again at the next start", file=sys.stderr)
 
 
 class Lasting:
@@ -242,7 +242,7 @@ class Interrupt:
     def _handle(self, number: int, frame: Any) -> None:
         del frame
         self.requested = True
-        print(f"\nstopping: {self._first}; once more: at once", file=sys.stderr)
+        print(f"\nstopping: {self._first}; a second signal stops at once", file=sys.stderr)
         signal.signal(number, self._before[number])
 
     def __exit__(

@@ -159,8 +159,8 @@ def verified(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy,
     except (ImportError, FileNotFoundError) as error:
         return f"not verified: {error}"
     text = (
-        f"{found.at_a_step:.1e} of the range of r~ at a step and {found.in_closed_loop:.1e} in closed loop are the "
-        f"largest deviations from the policy in {verify.STEPS:,} steps"
+        f"largest deviations from the policy in {verify.STEPS:,} steps, as shares of the range of r~: "
+        f"{found.at_a_step:.1e} at a step, {found.in_closed_loop:.1e} in closed loop"
     )
     if not found.small:
         allowed = f"{verify.AT_A_STEP:.0e} and {verify.IN_CLOSED_LOOP:.0e}"

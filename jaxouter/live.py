@@ -89,9 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stopped = go(folder, loop, options.steps)
             report(folder, loop)
         except OSError as error:
-            raise SystemExit(f"error: {error}; what was saved before is whole") from None
+            raise SystemExit(f"error: {error}; what was saved before is intact") from None
     if stopped is not None:
-        print(f"{stopped}; saved, go on with the same command", file=sys.stderr)
+        print(f"{stopped}; saved, resume with the same command", file=sys.stderr)
         raise SystemExit(130 if stopped == "stopped" else 1)
 
 
@@ -181,8 +181,8 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     write_json(folder.path / "summary.json", found)
     unit = loop.live.env.plant.y_unit
     cli.table(
-        "MAE: of y, and of what it would have been on the same steps",
-        ["", "y", "had r passed", KEPT[loop.live.kept], "learned"],
+        "MAE: measured, and predicted for other policies on the same steps",
+        ["", "measured", "r~ = r", KEPT[loop.live.kept], "learned"],
         [[part, *(cli.number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
     )
     passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)

@@ -109,9 +109,9 @@ def parse(arguments: list[str]) -> Options:
         )
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
-                "--resume takes no other option but a plant or an agent of your own, --devices, --coordinator, "
-                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds "
-                "them all"
+                "--resume takes no other options than your own plant or agent, --devices, --coordinator, "
+                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug; the run folder holds "
+                "the rest"
             )
         run = Run.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> None:
                 kept = f"; what was learned is in {run.path}" if run.path.exists() else ""
                 raise ValueError(f"{error}{kept}") from error
             except (OSError, NotFiniteError) as error:
-                saved = f"what was saved before is whole, {go_on(run)}" if run.path.exists() else "nothing was saved"
+                saved = f"what was saved before is intact, {go_on(run)}" if run.path.exists() else "nothing was saved"
                 raise SystemExit(f"error: {error}; {saved}") from None
             except KeyboardInterrupt:  # the second Ctrl-C, or one after the training
                 finals = None
@@ -188,7 +188,7 @@ def chosen(config: TrainConfig) -> TrainConfig:
 
 def go_on(run: Run) -> str:
     """How to resume the run."""
-    return f"go on with: python -m jaxouter.train --resume {run.path}"
+    return f"resume with: python -m jaxouter.train --resume {run.path}"
 
 
 def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainState] | None:
@@ -196,10 +196,10 @@ def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainStat
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
     for name, low, high in config.randomise:
-        progress.print(f"each plant has its own {name}, from {low:g} to {high:g}")
+        progress.print(f"{name} is drawn from {low:g} to {high:g}")
     if devices.is_first():
         for change in run.changes() if options.resume is not None else ():
-            print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
+            print(f"warning: {change}: results may differ from those of an uninterrupted run", file=sys.stderr)
     begun, first = time.perf_counter(), scenarios.reported(config.plant)[0]
 
     @cache

@@ -79,7 +79,7 @@ def simulated(original: Plant, params: Any, key: chex.PRNGKey, episodes: int) ->
     *found, early, late = map(np.asarray, _moved(original, params, jax.random.split(key, episodes)))
     off = np.abs(early[:, : late.shape[1]] - late).max(1)
     if np.any(off > 1e-3 * np.abs(early).max(1)):
-        raise ValueError(f"plant {original.name!r} responds otherwise half an episode later")
+        raise ValueError(f"plant {original.name!r} responds differently half an episode later")
     return CounterfactualParams(*(jnp.asarray(x, float) for x in (np.zeros_like(early), early, *found)))
 
 

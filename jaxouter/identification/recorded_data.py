@@ -97,7 +97,7 @@ def _check(data: RecordedData) -> None:
         (steps <= 0.0, "it must increase from row to row"),
         (
             np.abs(steps - typical) > JITTER * typical,
-            f"the step must be constant within {JITTER:.1%}, here {typical:g}: cut the record, sample it anew, or "
+            f"the step must be constant within {JITTER:.1%}, here {typical:g}: cut the record, resample it, or "
             "write time with more digits",
         ),
     ):
@@ -316,8 +316,8 @@ def make(name: str, path: str, options: PlantOptions = PlantOptions()) -> tuple[
     """
     if (options.control_step, options.input, options.output) != (None, None, None):
         raise ValueError(
-            "recorded data tell their control step, and have one r~ and one y: leave --control-step, --input and "
-            "--output away"
+            "recorded data define the control step and have one r~ and one y; leave out --control-step, --input and "
+            "--output"
         )
     data, models = identified(path)
     bounds = options.r_tilde_bounds or (float(data.r_tilde.min()), float(data.r_tilde.max()))

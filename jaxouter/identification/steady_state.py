@@ -192,19 +192,19 @@ def unanswered(
         same = f"y is the same under {LEVELS} levels of r~ from {levels[0]:g} to {levels[-1]:g}"
         if longer.any():
             return (
-                f"{same} for {int((longer > 0).argmax())} control steps, its dead time, and an episode has {steps}: "
-                "make it several times as long as the dead time (episode_steps)"
+                f"{same} for {int((longer > 0).argmax())} control steps (the dead time), and an episode has {steps}; "
+                "make episodes several times as long as the dead time (episode_steps)"
             )
         return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
     most = float(moved.max())
     if most < TINY * setpoints:
         return (
-            f"all of r~, {low:g} to {high:g} {plant.y_unit}, moves y by {most:.3g} {plant.y_unit}, and its set-points "
-            f"span {setpoints:.3g} {plant.y_unit}: a gain so small holds none of them"
+            f"r~ from {low:g} to {high:g} {plant.y_unit} moves y by only {most:.3g} {plant.y_unit}, but the set-points "
+            f"span {setpoints:.3g} {plant.y_unit}: the gain is too small to hold them"
         )
     if abs(gain) * (high - low) > TINY * setpoints:
         return None  # significant in spite of the noise
-    return f"y does not move one way as r~ rises: it comes to {_numbers(y)} at r~ of {_numbers(levels)}"
+    return f"y neither rises nor falls steadily with r~: it settles at {_numbers(y)} for r~ of {_numbers(levels)}"
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -72,7 +72,7 @@ class PlantOptions:
         low, high = whole["r_tilde_bounds"]
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise ValueError(
-                f"r~ lies between {low:g} and {high:g}: give it finite bounds, by --r-tilde-bounds LOW HIGH"
+                f"the bounds of r~ are {low:g} and {high:g}; give finite ones with --r-tilde-bounds LOW HIGH"
             )
         whole.setdefault("setpoint_range", ((3 * low + high) / 4, (low + 3 * high) / 4))
         return whole
@@ -201,7 +201,7 @@ def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[
         experiment = _Experiment.of(description)
         bounds = tuple(float(_attribute(given, end) or math.nan) for end in ("min", "max"))
     except ValueError as error:
-        raise ValueError(f"{path} says what is no number: {error}") from None
+        raise ValueError(f"{path} has an attribute that is not a number: {error}") from None
     asked = experiment.step or 1.0 if options.control_step is None else options.control_step
     control_step = experiment.check(declaration.checked(declaration.POSITIVE, "--control-step", asked))
     declared = options.declared(
@@ -241,7 +241,7 @@ def _extracted(path: str, validate: bool) -> tuple[Any, str]:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         description = fmpy.read_model_description(folder, validate=validate)
     except ValidationError as error:
-        raise ValueError(f"{path}: {error}\nMend it, or take it as it is by --no-validate") from None
+        raise ValueError(f"{path}: {error}\nFix it, or accept it with --no-validate") from None
     except Exception as error:  # FMPy may raise anything on a file that is not an FMU
         raise ValueError(f"{path} is not a readable FMU: {said(error)}") from None
     if description.coSimulation is None or not str(description.fmiVersion).startswith(("2", "3")):

@@ -180,7 +180,7 @@ def open_folder(run: Path, given: Declaration, learn: bool) -> LiveFolder:
         if run.exists() and (not run.is_dir() or any(run.iterdir())):
             raise ValueError(f"{run} is not a run folder: it has no readable config.json")
         if not learn:
-            raise ValueError(f"there is no run {run}; train one, or begin one from nothing by --learn")
+            raise ValueError(f"there is no run {run}; train one, or start without one by --learn")
         if given.r_tilde_bounds is None or given.setpoint_range is None:
             raise ValueError("a loop without a trained run needs --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH")
     if not file.exists():

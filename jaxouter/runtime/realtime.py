@@ -217,7 +217,7 @@ class Loop:
         try:
             return None if y is None else float(y)
         except (TypeError, ValueError):
-            raise StepError(f"it gave {y!r}; it must give a number, or None where there is none") from None
+            raise StepError(f"it returned {y!r}; it must return a number, or None if there is none") from None
 
     def _apply(self, wanted: float, controls: bool) -> None:
         """A fault, and its end, switch at once; between policies the difference fades out."""

@@ -51,7 +51,7 @@ def choose(config: TrainConfig) -> Choice:
                 f"within an episode of {plant.episode_steps} control steps; r~ does nothing, or its dead time is longer"
             )
             raise ValueError(f"{error} {late}") from None
-        text = f"y of {plant.name} shows no effect of r~ beside its noise in {steps:,} control steps; history stays"
+        text = f"y of {plant.name} shows no effect of r~ above its noise in {steps:,} control steps; history stays"
         return Choice(replace(config, explored_steps=steps), None, (f"{text} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
 
@@ -72,13 +72,13 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
         whose = "--history" if config.history is not None else f"what {plant.name} declares"
         warnings.append(
             f"the dead time of {dead} control steps does not fit in the {history} past samples of the observation "
-            f"({whose}), which then can't tell what r~ is under way; set --history {wanted}"
+            f"({whose}), so the observation misses r~ that y has yet to follow; set --history {wanted}"
         )
     start, warned = _pretraining(config, plant, history if history > dead else wanted, dead)
     if 2 * dead > plant.episode_steps:
         warned += (
-            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
-            f"moves y only in the rest; {_longer(4 * dead)}",
+            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, so r~ "
+            f"moves y only in its remainder; {_longer(4 * dead)}",
         )
     if config.pretraining.lags is None and start.lags == history:
         start = replace(start, lags=None)

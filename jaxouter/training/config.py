@@ -265,5 +265,7 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     for cls, of_cls in (*parts, (kind, of_agent)):
         names = {f.name for f in dataclasses.fields(cast(Any, cls))}
         if set(of_cls) != names:
-            raise ValueError(f"the configuration has fields {sorted(map(str, set(of_cls) ^ names))} missing or unknown")
+            raise ValueError(
+                f"fields of the configuration are missing or unknown: {sorted(map(str, set(of_cls) ^ names))}"
+            )
     return msgspec.convert(whole, TrainConfig, dec_hook=lambda _, found: msgspec.convert(found, kind))

@@ -89,7 +89,7 @@ def connect(devices: int, processes: Processes) -> None:
     try:
         jax.distributed.initialize(processes.coordinator, processes.num_processes, processes.process_id)
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"the processes did not come together: {error}") from None
+        raise ValueError(f"the processes did not connect: {error}") from None
 
 
 def part() -> None:

@@ -64,17 +64,17 @@ def resources(config: TrainConfig) -> Resources:
     lines += [
         (
             "control steps",
-            f"{config.environment_steps:,} a seed, {config.identification_steps:,} of them recorded first",
+            f"{config.environment_steps:,} per seed, {config.identification_steps:,} of them recorded first",
         ),
-        ("updates", f"{config.total_updates:,} a seed in {config.epochs:,} epochs"),
+        ("updates", f"{config.total_updates:,} per seed in {config.epochs:,} epochs"),
         *((f"memory, {name}", _bytes(size)) for name, size in parts.items()),
-        ("memory of a seed, and a checkpoint", _bytes(whole)),
+        ("memory per seed, and per checkpoint", _bytes(whole)),
     ]
     here = -(-config.seeds // jax.process_count())
     # Random numbers of an epoch are drawn before it; off-policy learners hold those for drawing batches twice.
     data, rounds = config.agent.data, config.epoch // config.environments
     drawn = 16 * rounds * getattr(data, "updates", 1) * getattr(data, "batch_size", 1)
-    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more on its way to the disk
+    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more while it is being saved
     if start.gradient_steps:
         steps = start.episode_steps or trainer.env.plant.episode_steps
         # Back-propagation keeps activations of the whole episode; XLA was seen to allocate two thirds of them.
@@ -105,7 +105,7 @@ def arithmetic_lines(config: TrainConfig) -> list[tuple[str, str]]:
     counts = config.pretraining.gradient_steps, config.total_updates
     named = zip(("pretraining", "updates"), arithmetic(config), counts, strict=True)
     return [
-        (f"arithmetic, {name}", f"{flop / 1e6:,.0f} MFLOP each, {flop * count:.2g} FLOP a seed")
+        (f"arithmetic, {name}", f"{flop / 1e6:,.0f} MFLOP each, {flop * count:.2g} FLOP per seed")
         for name, flop, count in named
         if math.isfinite(flop)
     ]

@@ -82,7 +82,7 @@ class Run:
                     continue
                 raise ValueError(f"the folder {path} can't be made: {error.strerror}") from None
             return cls(path, config)
-        raise ValueError(f"{candidates[0]} exists; choose another --out, or go on with it by --resume {candidates[0]}")
+        raise ValueError(f"{candidates[0]} exists; choose another --out, or resume it with --resume {candidates[0]}")
 
     @classmethod
     def open(cls, path: Path) -> Run:
@@ -99,7 +99,7 @@ class Run:
                 "never imported because a run folder names it, so name this plant on the command line"
             )
         if name in REGISTRATIONS and was.get("sha256") != REGISTRATIONS[name].sha256:
-            message = f"{path}: {REGISTRATIONS[name].reference} is not what it was when the run was made"
+            message = f"{path}: {REGISTRATIONS[name].reference} has changed since the run was made"
             warnings.warn(message, RunWarning, stacklevel=2)
         return run
 
@@ -168,7 +168,7 @@ class Run:
             try:
                 checkpoint.read(path)
             except ValueError as error:
-                warnings.warn(f"{error}; it is left out", RunWarning, stacklevel=2)
+                warnings.warn(f"{error}; it is ignored", RunWarning, stacklevel=2)
                 del found[epoch]
         return found
 
@@ -242,7 +242,7 @@ class Run:
             actor = jax.eval_shape(trainer.policy.init_actor, jax.random.key(0))
             return checkpoint.load(path, jax.eval_shape(PretrainingState.begin, actor))[0]
         except ValueError as error:
-            warnings.warn(f"{error}; the pretraining begins anew", RunWarning, stacklevel=2)
+            warnings.warn(f"{error}; the pretraining starts over", RunWarning, stacklevel=2)
             return None
 
     def forget_pretraining(self) -> None:
