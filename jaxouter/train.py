@@ -62,9 +62,8 @@ class Options:
     out: Path | None = None
     """New folder for the run; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Resume the run in this folder. Name your own plant and agent again.
-    Besides, it allows only --episodes, --tensorboard, --dry-run, --debug, --devices, --coordinator, --num-processes and
-    --process-id. Results may differ if the number of devices changes."""
+    """Resume the run in this folder; name a plant or agent of your own again. Another --devices may change results.
+    Also allowed: --episodes, --tensorboard, --dry-run, --debug, --coordinator, --num-processes, --process-id."""
     coordinator: str | None = None
     """HOST:PORT of process 0, if there are several processes; --devices then counts those of all processes.
     In a SLURM step of several tasks or an indexed Kubernetes job (with `jax[k8s]`), JAX finds this and the next two."""
