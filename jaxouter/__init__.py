@@ -4,7 +4,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
-if sys.version_info < (3, 12):  # jaxlib 0.10, which complains of its own compilation cache (jax issue 38445)
+if sys.version_info < (3, 12):  # jaxlib 0.10 logs errors about its own compilation cache (jax issue 38445)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """`make` when it is first used: a controller that was exported imports no JAX."""
+    """Import `make` on first use, so that an exported controller does not import JAX."""
     if name != "make":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from jaxouter.loop.environment import make

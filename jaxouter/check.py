@@ -1,4 +1,4 @@
-"""`python -m jaxouter.check`: does a plant implement the interface, and what is it like."""
+"""`python -m jaxouter.check`: test whether a plant implements the interface, and show how it responds."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.choice import choose
 from jaxouter.training.config import preset
 
-STEPS = (0.1, 0.25, 0.5)  # moves of r~ up from the middle of its range, as shares of it, and as many down
-MOVED = 1e-3  # of the largest response soon after: y that has moved so far has begun to
-SOON = 10  # control steps after the beginning, at least
+STEPS = (0.1, 0.25, 0.5)  # steps of r~ up and down from the middle of its range, as shares of the range
+MOVED = 1e-3  # y has begun to respond at this share of the largest response soon after
+SOON = 10  # least control steps after the start that count as soon
 
 
 @dataclass(frozen=True)
 class Options:
     """Test whether your own plant implements the interface, and show how it responds to r~.
 
-    The exit status is 1 if it does not. Models of recorded data (log:FILE) are validated instead. With --figure the
-    result is drawn too: y after r~ has moved up or down from the middle of its range, or the validation of the models.
+    The exit status is 1 if it does not. For recorded data (log:FILE) the identified models are validated instead.
+    --figure draws the result: step responses of y from the middle of the range of r~, or the validation.
     """
 
     plant: Annotated[str, tyro.conf.Positional]
-    """FILE.py:NAME, the entry point of an installed package, gym:ID, fmu:FILE, log:FILE, pitch or heaters."""
+    """Plant: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE, an installed package's entry point, pitch or heaters."""
     figure: Path | None = None
-    """File for the picture; default: none is drawn."""
+    """File for the figure; default: no figure."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
-    """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
+    """What a plant gym:ID, fmu:FILE or log:FILE does not declare itself."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -76,17 +76,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def validation_report(plant: Plant, path: str) -> Callable[[Path], Path]:
-    """Validate the models of recorded data; returns what draws the validation."""
-    told = validation.validate(*recorded_data.identified(path))
-    rows = [list(row) for row in validation.table(told, plant.y_unit, plant.time_unit)]
+    """Validate the models of recorded data; returns a function that draws the validation."""
+    found = validation.validate(*recorded_data.identified(path))
+    rows = [list(row) for row in validation.table(found, plant.y_unit, plant.time_unit)]
     cli.table(f"{plant.name}: model validation", ["what", "is"], rows)
-    for warning in told.warnings:
+    for warning in found.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return lambda figure: figures.log_report(figure, told, plant.name, plant.y_unit, plant.time_unit)
+    return lambda figure: figures.log_report(figure, found, plant.name, plant.y_unit, plant.time_unit)
 
 
 def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
-    """How the plant responds to r~; returns what draws it."""
+    """Show how the plant responds to r~; returns a function that draws it."""
     found = steady_state.dc_gain(plant, params, jax.random.key(0))
     moves, responses = step_responses(plant, params)
     choice = choose(preset(plant.name))
@@ -106,12 +106,12 @@ def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
 
 
 def within_reach(plant: Plant, found: steady_state.DcGain) -> list[float]:
-    """Least and greatest y that r~ holds, by the DC gain."""
+    """Least and greatest steady-state y within the bounds of r~, by the DC gain."""
     return sorted(float(found.offset + found.gain * end) for end in plant.r_tilde_bounds)
 
 
 def steady(plant: Plant, found: steady_state.DcGain) -> list[tuple[str, str]]:
-    """What y comes to, or does instead."""
+    """Rows on the steady state of y, or on what y does instead of settling."""
     unit = plant.y_unit
     if found.unsettled is not None:
         change = f"by {found.rate:.3g} {unit} a control step for each {unit} of r~ beyond {found.still:.3g}"
@@ -124,7 +124,7 @@ def steady(plant: Plant, found: steady_state.DcGain) -> list[tuple[str, str]]:
 
 
 def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray]:
-    """Moves of r~ from the middle of its range (n,), and what y does more than without them (n, T); the same noise."""
+    """Steps of r~ from the middle of its range (n,), and the change of y they cause (n, T), under the same noise."""
     low, high = plant.r_tilde_bounds
     moves = (high - low) * np.array([-share for share in reversed(STEPS)] + list(STEPS))
     key = jax.random.key(0)
@@ -135,9 +135,9 @@ def step_responses(plant: Plant, params: object) -> tuple[np.ndarray, np.ndarray
 
 
 def dead_time(responses: np.ndarray) -> int:
-    """Control steps before any response (n, T) begins, beyond the one of sampling.
+    """Control steps before any response (n, T) begins, in addition to the one of sampling.
 
-    It begins where it is no longer small beside what it comes to in twice the time, since it may grow without an end.
+    A response has begun once it is not small compared with its value at twice the time, as it may grow without bound.
     """
     largest = np.maximum.accumulate(np.abs(responses).max(0))
     soon = np.minimum(2 * np.arange(len(largest)) + SOON, len(largest) - 1)

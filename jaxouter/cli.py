@@ -1,4 +1,4 @@
-"""What the commands share: errors for people, the compilation cache, progress, tables."""
+"""Shared by the commands: readable errors, the compilation cache, progress, tables."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NARROWEST = 20  # columns
 
 
 def on_terminal() -> bool:
-    """Whether what is printed is seen at once; there may be no standard output, or one of another kind."""
+    """Whether standard output is a terminal; it may also be missing or of another type."""
     try:
         return sys.stdout.isatty()
     except (AttributeError, ValueError):
@@ -47,7 +47,7 @@ def on_terminal() -> bool:
 
 
 def set_columns() -> None:
-    """What is narrower than any text counts as 20 columns: rich prints nothing in 0, tyro's help never ends in 1."""
+    """Assume at least 20 columns: rich prints nothing with 0, and tyro's help never ends with 1."""
     columns = shutil.get_terminal_size().columns
     if "COLUMNS" in os.environ or columns < NARROWEST:
         os.environ["COLUMNS"] = str(max(columns, NARROWEST))
@@ -55,17 +55,17 @@ def set_columns() -> None:
 
 set_columns()
 console = Console(
-    width=None if on_terminal() else 140,  # a file is not cut to 80 columns
+    width=None if on_terminal() else 140,  # rich would cut lines in a file to 80 columns
     force_terminal=False if os.environ.get("TERM") in ("dumb", "unknown") else None,  # plain lines, no bars
 )
 
 
 @contextmanager
 def user_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
-    """A ValueError in here is the user's mistake, or a plant's: one message, exit status 2.
+    """Report a ValueError, a mistake of the user or of a plant, as one message with exit status 2.
 
     Args:
-        arguments: of the command; None: those of the program. With `--debug` among them the trace is shown too.
+        arguments: of the command; None: those of the program. With `--debug` the traceback is shown too.
     """
     warnings.simplefilter("always", RunWarning)
     warnings.simplefilter("once", IdentificationWarning)
@@ -84,7 +84,7 @@ def user_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
 
 
 def missing_backend() -> str | None:
-    """What JAX is told to run on and does not find, and what there is; JAX raises all kinds of errors then."""
+    """Message if JAX is told to use a platform that it does not find (it then raises all kinds of errors); or None."""
     for variable in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
         asked = jax.config.values[variable.lower()]
         if asked and asked != "cpu":
@@ -100,7 +100,7 @@ def missing_backend() -> str | None:
 
 @contextmanager
 def optional(what: str) -> Iterator[None]:
-    """What fails in here ends nothing: a line says what there is none of."""
+    """Turn an error in here into a warning that there is no `what`."""
     try:
         yield
     except Exception as error:  # whatever a library raises
@@ -108,9 +108,10 @@ def optional(what: str) -> Iterator[None]:
 
 
 def show(message: Warning | str, *_: object) -> None:
-    """A warning in one line; none of half an entry of the compilation cache, left by a kill or being written now.
+    """Print a warning in one line, except for incomplete entries of the compilation cache.
 
-    JAX compiles then, but writes no entry where there is one: it is removed, else later processes would compile too.
+    Such an entry was left by a killed process, or is being written now. JAX compiles, but never overwrites the entry,
+    so it is removed here; otherwise later processes would compile too.
     """
     text, folder = str(message), jax.config.values["jax_compilation_cache_dir"]
     half = re.match("Error reading persistent compilation cache entry for '(.+?)'", text)
@@ -126,23 +127,23 @@ def show(message: Warning | str, *_: object) -> None:
 
 @functools.cache
 def _not_kept(folder: str) -> None:
-    print(f"warning: {folder} can't be written: functions are compiled anew at the next start", file=sys.stderr)
+    print(f"warning: {folder} can't be written: functions are compiled again at the next start", file=sys.stderr)
 
 
 class Lasting:
-    """An output stream whose end is not that of the work: a pipe nobody reads, a full disk, a terminal that is gone."""
+    """An output stream that may fail without ending the program: a closed pipe, a full disk, a lost terminal."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write, or drop."""
+        """Write, or drop the text."""
         with self._lasting():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush, or drop."""
+        """Flush, or drop the text."""
         with self._lasting():
             self._stream.flush()
 
@@ -152,8 +153,8 @@ class Lasting:
             yield
         except OSError as error:
             with open(os.devnull, "wb") as nothing:
-                os.dup2(nothing.fileno(), self._stream.fileno())  # with what waits to be written
-            if self is sys.stdout and error.errno != errno.EPIPE:  # who closes a pipe knows
+                os.dup2(nothing.fileno(), self._stream.fileno())  # discards the buffered text too
+            if self is sys.stdout and error.errno != errno.EPIPE:  # no warning for a closed pipe
                 print(f"warning: the output can't be written ({error.strerror}); going on without", file=sys.stderr)
 
     def __getattr__(self, name: str) -> Any:
@@ -161,7 +162,7 @@ class Lasting:
 
 
 def last() -> None:
-    """Let the streams of this process outlast what they are connected with; signs that they don't know become '?'."""
+    """Make stdout and stderr `Lasting`; characters that they can't encode become '?'."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name) or open(os.devnull, "w")  # noqa: SIM115 - as long as the process
         if not isinstance(stream, Lasting):
@@ -170,9 +171,9 @@ def last() -> None:
 
 
 def run(main: Callable[[], None]) -> None:
-    """The command as a program: Ctrl-C, where nothing else handles it, ends it quietly with status 130.
+    """Run a command as a program: Ctrl-C, if not handled elsewhere, ends it silently with status 130.
 
-    A file that can't be read or written is told in one line, with status 1.
+    A file that can't be read or written is reported in one line, with status 1.
     """
     last()
     try:
@@ -184,7 +185,7 @@ def run(main: Callable[[], None]) -> None:
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled functions in the user's cache folder, unless JAX is told otherwise."""
+    """Keep compiled functions in the user's cache folder, unless JAX is configured otherwise."""
     warnings.showwarning = show
     if not jax.config.values["jax_compilation_cache_dir"] and (folder := cache.usable()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
@@ -192,14 +193,14 @@ def use_compilation_cache() -> None:
 
 
 def use_own(registered: Iterable[Registration], own_agents: Iterable[str]) -> None:
-    """What a process of its own begins with: plants and agents that its parent knows, and the compilation cache."""
+    """Set up a child process: the plants and agents that its parent has registered, and the compilation cache."""
     last()
     for plant in registered:
         add(plant.reference, plant.options)
     for agent in own_agents:
         add_agent(agent)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the parent has said what there is to say of the cache
+        warnings.simplefilter("ignore")  # the parent has already warned about the cache
         use_compilation_cache()
     warnings.showwarning = show
 
@@ -217,13 +218,13 @@ def print_lists() -> None:
 
 
 def progress(shown: bool = True) -> Progress:
-    """Progress on the console of the commands; not shown in processes but the first."""
-    jax.devices()  # what is not there is said before anything else, see `missing_backend`
+    """Progress on the commands' console; shown in the first process only."""
+    jax.devices()  # report a missing platform before anything else, see `missing_backend`
     return Progress(console, shown)
 
 
 class Interrupt:
-    """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can save itself; the second one ends it at once."""
+    """Turns the first Ctrl-C or SIGTERM into a flag, so that a run can be saved; the second one ends it at once."""
 
     def __init__(self, first: str = "the epoch of all seeds ends, then everything is saved") -> None:
         """Args: first: what happens before it ends."""
@@ -232,16 +233,16 @@ class Interrupt:
     def __enter__(self) -> Interrupt:
         self._before: dict[int, Any] = {}
         if threading.current_thread() is not threading.main_thread():
-            return self  # Python hands signals to the main thread alone
+            return self  # Python delivers signals to the main thread only
         for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) != signal.SIG_IGN:  # what a shell runs in its background stays deaf
+            if signal.getsignal(number) != signal.SIG_IGN:  # a shell's background jobs ignore Ctrl-C
                 self._before[number] = signal.signal(number, self._handle)
         return self
 
     def _handle(self, number: int, frame: Any) -> None:
         del frame
         self.requested = True
-        print(f"\nstopping: {self._first}; once more: at once", file=sys.stderr)
+        print(f"\nstopping: {self._first}; a second signal stops at once", file=sys.stderr)
         signal.signal(number, self._before[number])
 
     def __exit__(
@@ -252,9 +253,9 @@ class Interrupt:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; the first column to the left, the others to the right.
+    """Print a table; the first column is left-aligned, the others right-aligned.
 
-    Narrow output is not cut: a table that is too wide has no box and, if need be, is printed in parts.
+    Nothing is cut: a table that is too wide loses its box and, if need be, is printed in parts.
     """
     plain = [[Text.from_markup(row[i]).plain for row in (columns, *rows)] for i in range(len(columns))]
     least = [
@@ -282,5 +283,5 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A figure for a table, with so many significant digits whatever its unit; a dash where it is not defined."""
+    """A number for a table, with so many significant digits; a dash for None."""
     return "-" if value is None else significant(value, digits)

@@ -1,4 +1,4 @@
-"""`python -m jaxouter.export`: the controller that a run has learned, as a file for other tools."""
+"""`python -m jaxouter.export`: export the controller of a run as a file for other tools."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
 
 @dataclass(frozen=True)
 class Options:
-    """Export the controller that a run has learned: history, scaling, network and bounds, with its state explicit.
+    """Export the controller that a run has learned: history, scaling, network and bounds, with explicit state.
 
-    --format may be: onnx (a graph; needs the extra onnx), npz (the numbers, for jaxouter.exports.spec, which is NumPy),
-    stablehlo (for jax.export), c (C99 without memory allocation: a .c and a .h file) or fmu (FMI 2.0 co-simulation;
-    needs a C compiler). The file is run beside the policy before it is put in its place.
+    Formats: onnx (a graph; needs the extra onnx), npz (the numbers, for jaxouter.runtime.Controller in NumPy),
+    stablehlo (for jax.export), c (C99 without memory allocation: a .c and a .h file) and fmu (FMI 2.0 co-simulation;
+    needs a C compiler). The file is verified against the policy before it is written to its place.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder (its median seed is exported), or the folder of one seed in it."""
     plant: str | None = None
-    """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; its options are those of the run."""
+    """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; its options come from the run."""
     agent: str | None = None
     """The run's agent, if your own: FILE.py:CLASS."""
     format: str | None = None
@@ -41,9 +41,9 @@ class Options:
     out: Path | None = None
     """File to write, which must not exist; default: controller.FORMAT in the folder."""
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Export what was learned even where the run found it to be worse than r~ = r or the static prefilter."""
+    """Export even if the run found its policy worse than r~ = r or the static prefilter."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -75,13 +75,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def check(options: Options) -> tuple[Path, str, Path]:
-    """Everything that can be wrong and found without work.
+    """Check everything that can be checked quickly.
 
     Returns:
         Folder of the run, format, and the file to write.
 
     Raises:
-        ValueError: the options name what does not exist, what exists already, or what can't be made here.
+        ValueError: an option names something that is missing, exists already, or can't be made here.
     """
     kind, run = options.format, options.run
     if run is None:
@@ -114,12 +114,12 @@ def check(options: Options) -> tuple[Path, str, Path]:
 
 
 def written(kind: str, out: Path) -> list[Path]:
-    """The files that an export consists of."""
+    """The files of an export."""
     return [out, out.with_suffix(".h")] if kind == "c" else [out]
 
 
 def needed(kind: str) -> None:
-    """Raises ImportError or FileNotFoundError where what makes a format is not installed."""
+    """Raises ImportError or FileNotFoundError if a requirement of the format is not installed."""
     if kind == "onnx":
         from jaxouter.exports import onnx  # noqa: F401
     elif kind == "stablehlo":
@@ -149,18 +149,18 @@ def write(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, pa
 
 
 def verified(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> str:
-    """What running the file showed, in a line.
+    """Verify the file; returns the result in one line.
 
     Raises:
-        SystemExit: it is not what the policy does.
+        SystemExit: it differs from the policy.
     """
     try:
         found = verify.verify(kind, path, spec, policy, params)
     except (ImportError, FileNotFoundError) as error:
         return f"not verified: {error}"
     text = (
-        f"{found.at_a_step:.1e} of the range of r~ at a step and {found.in_closed_loop:.1e} in closed loop are the "
-        f"largest deviations from the policy in {verify.STEPS:,} steps"
+        f"largest deviations from the policy in {verify.STEPS:,} steps, as shares of the range of r~: "
+        f"{found.at_a_step:.1e} at a step, {found.in_closed_loop:.1e} in closed loop"
     )
     if not found.small:
         allowed = f"{verify.AT_A_STEP:.0e} and {verify.IN_CLOSED_LOOP:.0e}"

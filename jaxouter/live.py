@@ -1,4 +1,4 @@
-"""`python -m jaxouter.live`: act on a loop in real time, and learn from it."""
+"""`python -m jaxouter.live`: run an outer loop in real time, and learn online."""
 
 from __future__ import annotations
 
@@ -29,37 +29,38 @@ KEPT = {"static": "static inverse", "trained": "as trained"}
 
 @dataclass(frozen=True)
 class Options:
-    """Put an outer loop around a function step(r~) -> y, once every DT seconds, and learn from what comes.
+    """Run an outer loop around your function step(r~) -> y, once every DT seconds, and optionally learn online.
 
-    With a trained run its policy acts. Where there is no such run, --learn begins from nothing: r passes through while
-    a record is made, then the static inverse acts. What is learned takes over as soon as the record tells that it is
-    better, and goes back where it turns out worse. A missed deadline passes r for that step.
+    If RUN is a trained run, its policy acts. Otherwise --learn starts without one: r passes through while a record is
+    made, then the static inverse acts. The learned policy takes over once it is predicted to be better, and is replaced
+    again if it turns out worse. If a deadline is missed, r passes through for that step.
 
-    State, a row a step, a summary and a picture go to RUN/live; the same command goes on from there. Ctrl-C saves.
+    State, one row per step, a summary and a figure are written to RUN/live. Ctrl-C stops and saves; the same command
+    resumes.
     """
 
     step: Annotated[str, tyro.conf.Positional]
-    """FILE.py:NAME or MODULE:NAME of a function that shows the loop r~ and gives y as it is then measured, or None."""
+    """FILE.py:NAME or MODULE:NAME of a function that applies r~ and returns the measured y, or None if missing."""
     run: Path
-    """Run folder, or the folder of one seed in it; or one that is not there yet."""
+    """Run folder, or the folder of one seed in it; with --learn it need not exist yet."""
     declaration: Annotated[Declaration, tyro.conf.arg(name="")]
     learn: bool = False
-    """Learn from what comes, in the time that is left of each period; r~ then explores a little."""
+    """Learn online, in the spare time of each period; r~ then explores a little."""
     steps: int | None = None
     """Control steps; default: until Ctrl-C."""
     reference: str = "staircase"
-    """r: a number, a CSV file with a column r (a row a period, then from its beginning), or a family of random
-    references: steps, staircase, ramps, sines, doublets, days."""
+    """r: a number, a CSV file with a column r (one row per period, repeated), or a family of random references.
+    The families are steps, staircase, ramps, sines, doublets, days."""
     record: int = 500
-    """Control steps of which a record is made before it is looked at."""
+    """Control steps to record before the response is identified."""
     updates: int = 8
-    """Most updates a period."""
+    """Most updates per period."""
     plant: str | None = None
     """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE."""
     agent: str | None = None
     """The run's agent, if your own: FILE.py:CLASS."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -73,29 +74,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = open_folder(options.run, options.declaration, options.learn)
         cli.use_compilation_cache()
         live, state = folder.begin()
-        said, declared = folder.declaration, live.env.plant
-        r = reference(options.reference, declared.setpoint_range, said.episode_steps, said.seed)
+        own, declared = folder.declaration, live.env.plant
+        r = reference(options.reference, declared.setpoint_range, own.episode_steps, own.seed)
         stack.enter_context(folder.lock())
-        settings = Timing(said.dt, options.learn, options.record, options.updates)
+        settings = Timing(own.dt, options.learn, options.record, options.updates)
         before = folder.columns().get("time", np.zeros(0))
-        begin = float(before[-1]) + 2 * said.dt if len(before) else 0.0  # a gap, where it was stopped
+        begin = float(before[-1]) + 2 * own.dt if len(before) else 0.0  # a gap where it was stopped
         loop = Loop(live, state, plant, lambda k: float(r[k % len(r)]), settings, begin)
-        if (declared.control_step, declared.time_unit) != (said.dt, "s"):
+        if (declared.control_step, declared.time_unit) != (own.dt, "s"):
             trained = f"{declared.control_step:g} {declared.time_unit}"
-            print(f"warning: the period is {said.dt:g} s; the policy was trained for {trained}", file=sys.stderr)
-        print(f"{options.step}, every {said.dt:g} s -> {folder.path}; r~ in {list(live.observer.r_tilde_bounds)}")
+            print(f"warning: the period is {own.dt:g} s; the policy was trained for {trained}", file=sys.stderr)
+        print(f"{options.step}, every {own.dt:g} s -> {folder.path}; r~ in {list(live.observer.r_tilde_bounds)}")
         try:
             stopped = go(folder, loop, options.steps)
             report(folder, loop)
         except OSError as error:
-            raise SystemExit(f"error: {error}; what was saved before is whole") from None
+            raise SystemExit(f"error: {error}; what was saved before is intact") from None
     if stopped is not None:
-        print(f"{stopped}; saved, go on with the same command", file=sys.stderr)
+        print(f"{stopped}; saved, resume with the same command", file=sys.stderr)
         raise SystemExit(130 if stopped == "stopped" else 1)
 
 
 def check(options: Options) -> Callable[[float], Any]:
-    """The function, if all else that can be found without work is right.
+    """Check the options; returns the user's function.
 
     Raises:
         ValueError: there is no such function, or a number is out of range.
@@ -111,7 +112,7 @@ def check(options: Options) -> Callable[[float], Any]:
     else:
         try:
             found = getattr(importlib.import_module(file), name)
-        except Raised as error:  # whatever the module raises
+        except Raised as error:  # the module's code may raise anything
             raise ValueError(f"{options.step} can't be imported: {error}") from None
     if not callable(found):
         raise ValueError(f"{options.step} is {found!r}; it must be a function of r~ that gives y")
@@ -119,18 +120,18 @@ def check(options: Options) -> Callable[[float], Any]:
 
 
 def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
-    """Run, with progress, and save; why it ended early."""
+    """Run with progress, then save; returns why it ended early, or None."""
     stopped = None
     with cli.Interrupt("everything is saved") as interrupt, cli.progress() as progress, folder.rows() as rows:
         progress.phase("running", steps or 0)
         tell = Telling(loop, progress)
 
-        def heard(row: Row) -> None:
+        def record(row: Row) -> None:
             rows.writerow(row)
             tell(row)
 
         try:
-            run(loop, steps, lambda: interrupt.requested, heard)
+            run(loop, steps, lambda: interrupt.requested, record)
         except (StepError, OSError) as error:
             stopped = f"error: {error}"
         folder.save(loop)
@@ -138,9 +139,9 @@ def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
 
 
 class Telling:
-    """What goes on, and each change of the stage."""
+    """Shows the state of the loop, and prints each change of stage."""
 
-    SECONDS = 0.5  # between two looks
+    SECONDS = 0.5  # between two updates of the display
 
     def __init__(self, loop: Loop, progress: Progress) -> None:
         self._loop, self._progress, self._last = loop, progress, time.monotonic()
@@ -172,7 +173,7 @@ class Telling:
 
 
 def report(folder: LiveFolder, loop: Loop) -> None:
-    """Summary, figure and table."""
+    """Write the summary and the figure, print the table."""
     if not loop.act_seconds:
         return
     columns = folder.columns()
@@ -180,8 +181,8 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     write_json(folder.path / "summary.json", found)
     unit = loop.live.env.plant.y_unit
     cli.table(
-        "MAE: of y, and of what it would have been on the same steps",
-        ["", "y", "had r passed", KEPT[loop.live.kept], "learned"],
+        "MAE: measured, and predicted for other policies on the same steps",
+        ["", "measured", "r~ = r", KEPT[loop.live.kept], "learned"],
         [[part, *(cli.number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
     )
     passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)

@@ -1,4 +1,4 @@
-"""What a command is doing, how far it is and how long it still takes: live on a terminal, plain lines elsewhere."""
+"""Progress of a command: phase, share done and time left; live on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from rich.table import Column
 from rich.text import Text
 
 LINE_SECONDS = 5.0  # between two plain lines, at most
-FIRST = 0.1  # share of the work from which on its first piece tells the pace: smaller ones are mostly compilation
-NARROW = 30  # columns, below which the bar alone shows the share
+FIRST = 0.1  # a first piece smaller than this share of the work is mostly compilation and does not give the pace
+NARROW = 30  # columns; on narrower terminals the percentage is left out
 
 
 class TimeLeft:
     """Time left, from the pace so far."""
 
     def __init__(self, total: float, now: float, done: float = 0.0) -> None:
-        """Args: total: all work, in any unit; now: time, s; done: work that was done before."""
+        """Args: total: all work, in any unit; now: time, s; done: work done before."""
         self.total, self.done = total, done
-        self._from: tuple[float, float] | None = (now, done)  # time and work from which on the pace is measured
+        self._from: tuple[float, float] | None = (now, done)  # time and work at which the pace measurement starts
         self._last: float | None = None  # time of the last piece
-        self._pace: float | None = None  # seconds a unit
+        self._pace: float | None = None  # seconds per unit of work
 
     def reach(self, done: float, now: float) -> None:
-        """So much is done."""
+        """Set the work that is done."""
         early = self._last is None and self._pace is None and done - self.done < FIRST * self.total
         if self._from is None or early:
             self._from = now, done
@@ -39,31 +39,31 @@ class TimeLeft:
         self.done, self._last = min(done, self.total), now
 
     def pause(self) -> None:
-        """The time until the next piece is done doesn't count: something else is going on."""
+        """Leave out the time until the next piece is done: something else is going on."""
         self._from = self._last = None
 
     def left(self, now: float) -> float | None:
-        """Seconds; None where nothing is known yet."""
+        """Seconds left; None if unknown so far."""
         if self._pace is None:
             return None
         return max(0.0, self._pace * (self.total - self.done) - (now - (self._last or now)))
 
 
 class Progress:
-    """Phases of a command, one after the other, and a bar with the time left.
+    """The current phase of a command, and a bar with the time left.
 
-    Terminals too narrow for all of it wrap the text and shorten the bar.
+    Narrow terminals wrap the text and shorten the bar.
     """
 
     def __init__(self, console: Console, shown: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
-        """Args: console: where to; shown: False: say nothing (processes but the first); clock: s."""
+        """Args: console: to print on; shown: False prints nothing (in all processes but the first); clock: s."""
         self._console, self._shown, self._clock = console, shown, clock
         notebook = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
         self._live = (console.is_terminal and not console.is_dumb_terminal) or notebook
-        self._what, self._said, self._since, self._printed = "", dict[str, str](), clock(), clock()
+        self._what, self._notes, self._since, self._printed = "", dict[str, str](), clock(), clock()
         self._work: TimeLeft | None = None
         self._counter: Callable[[], float] | None = None
-        self._counted, self._before = 0.0, 0.0  # by the counter, and work done, when the last piece was
+        self._counted, self._before = 0.0, 0.0  # the counter, and the work done, at the last piece
         self._ended = threading.Event()
         share = [bars.TaskProgressColumn()] if console.width >= NARROW else []
         self._bar = bars.Progress(bars.BarColumn(None), *share, _Time(self), expand=True)
@@ -73,7 +73,7 @@ class Progress:
             console=console,
             refresh_per_second=4,
             transient=True,
-            redirect_stderr=sys.stderr is not None and sys.stderr.isatty(),  # else a file gets what is for it
+            redirect_stderr=sys.stderr is not None and sys.stderr.isatty(),  # not if stderr goes to a file
         )
 
     def __enter__(self) -> Progress:
@@ -97,17 +97,17 @@ class Progress:
     def phase(
         self, what: str, total: float | None = None, done: float = 0.0, counter: Callable[[], float] | None = None
     ) -> None:
-        """What is going on from now on.
+        """Begin a phase.
 
         Args:
-            what: a few words.
-            total: work of a new bar, 0 if nobody knows; None: the bar stays, and the time until it moves doesn't count.
-            done: of that total, before now.
-            counter: work counted since any time, asked now and then: moves the bar within long pieces.
+            what: its name, in a few words.
+            total: work of a new bar, 0 if unknown; None: keep the bar, and leave out the time until it moves.
+            done: part of the total that is already done.
+            counter: counts work from any origin; asked now and then, to move the bar within long pieces.
         """
         now = self._clock()
         if total is not None:
-            self._work, self._said, self._before = TimeLeft(total, now, done) if total else None, {}, done
+            self._work, self._notes, self._before = TimeLeft(total, now, done) if total else None, {}, done
             self._bar.remove_task(self._task)
             self._task = self._bar.add_task("", total=total or None, completed=int(done), start=done > 0)
         elif self._work is not None:
@@ -117,39 +117,39 @@ class Progress:
         if not self._live:
             self._line()
 
-    def advance(self, work: float = 1.0, **said: str) -> None:
-        """A piece of the work is done; `said` is shown until the next bar, by name."""
-        self.reach(self._before + work, **said)
+    def advance(self, work: float = 1.0, **notes: str) -> None:
+        """Add a finished piece of work; see `say` for the notes."""
+        self.reach(self._before + work, **notes)
 
-    def reach(self, done: float, **said: str) -> None:
-        """So much of the work is done; `said` as of `advance`."""
-        self.say(**said)
+    def reach(self, done: float, **notes: str) -> None:
+        """Set the work that is done; see `say` for the notes."""
+        self.say(**notes)
         self._before = done
         if self._counter is not None:
             self._counted = self._counter()
         self._move(done)
 
-    def say(self, **said: str) -> None:
-        """What is shown beside the phase until the next bar, by name; an empty text is taken away."""
-        self._said = {name: text for name, text in {**self._said, **said}.items() if text}
+    def say(self, **notes: str) -> None:
+        """Show notes next to the phase until the next bar; a note replaces one of the same name, '' removes it."""
+        self._notes = {name: text for name, text in {**self._notes, **notes}.items() if text}
 
     def print(self, text: str) -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         if self._shown:
             self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=not self._live)
 
     @property
     def line(self) -> str:
         """Everything in one line."""
-        parts = [self._what, *self._said.values()]
+        parts = [self._what, *self._notes.values()]
         if self._work is not None and self._work.done:
             parts.append(f"{100 * self._work.done / self._work.total:.0f} %")
-        begins = not self._said and self._clock() - self._since < 1.0
+        begins = not self._notes and self._clock() - self._since < 1.0
         return "  ".join(parts if begins else [*parts, self.time])
 
     @property
     def time(self) -> str:
-        """Time left or, where nothing is known yet, elapsed in this phase."""
+        """Time left or, if unknown so far, elapsed in this phase."""
         now = self._clock()
         left = None if self._work is None else self._work.left(now)
         if left is not None:
@@ -169,7 +169,7 @@ class Progress:
 
     def _render(self) -> Group:
         self._count()
-        text = Text("  ".join(self._said.values()))
+        text = Text("  ".join(self._notes.values()))
         return Group(Text.assemble((self._what, "bold"), "  " if text else "", text), self._bar)
 
     def _tick(self) -> None:

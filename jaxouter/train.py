@@ -1,4 +1,4 @@
-"""`python -m jaxouter.train`: learn an outer loop, and see what it is worth."""
+"""`python -m jaxouter.train`: learn an outer loop, and evaluate it."""
 
 from __future__ import annotations
 
@@ -43,51 +43,50 @@ from jaxouter.training.resources import arithmetic, arithmetic_lines, resources
 from jaxouter.training.run import FORMAT, Run, add_agent, lock, write_json
 from jaxouter.training.trainer import Trainer
 
-LOOK_SECONDS = 5.0  # between two looks at the MAE during the pretraining, at least
+LOOK_SECONDS = 5.0  # least time between two evaluations of the MAE during pretraining
 FRESH = 4  # folded into a key
 PROCESSES = tuple(Processes.__dataclass_fields__)
-WATCHING = 0.1  # of the time of learning so far, which the first look at the MAE may take of a plant outside JAX
+WATCHING = 0.1  # share of the learning time so far that the first evaluation may take on a plant outside JAX
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train an outer loop on a plant (pitch, heaters or your own) and show what came out.
+    """Train an outer loop on a plant (pitch, heaters or your own) and evaluate it.
 
-    Without options the pitch plant is learned with the default preset. The preset sets every other field; what is
-    given here overrides it. `--list` prints plants, presets, scenarios, agents and policies.
+    Without options it trains on the pitch plant with the default preset. The preset supplies all defaults; options
+    override it. `--list` prints plants, presets, scenarios, agents and policies.
     """
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     agent: str | None = None
-    """Agent that learns, or FILE.py:CLASS, its settings, of your own; default: that of the preset. See --list."""
+    """Agent (see --list), or your own: FILE.py:CLASS of its settings; default: the preset's."""
     out: Path | None = None
-    """Folder for the run, which must not exist; default: runs/PLANT-PRESET-SEED."""
+    """New folder for the run; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
-    """Go on with the run in this folder; takes no other option but a plant and an agent of your own, which are named
-    again, --episodes, --tensorboard, --dry-run, --debug, --devices (results differ if a learner then spans another
-    number of them) and how to find the other processes."""
+    """Resume the run in this folder; name a plant or agent of your own again. Another --devices may change results.
+    Also allowed: --episodes, --tensorboard, --dry-run, --debug, --coordinator, --num-processes, --process-id."""
     coordinator: str | None = None
-    """HOST:PORT of process 0, where there is more than one process; --devices then counts those of all. In a step of
-    several SLURM tasks or an indexed Kubernetes job (with `jax[k8s]`) JAX finds this and the next two by itself."""
+    """HOST:PORT of process 0, if there are several processes; --devices then counts those of all processes.
+    In a SLURM step of several tasks or an indexed Kubernetes job (with `jax[k8s]`), JAX finds this and the next two."""
     num_processes: int | None = None
-    """Processes in all, each started with the same options but its own --process-id."""
+    """Number of processes. Start each with the same options, except --process-id."""
     process_id: int | None = None
     """Number of this process, from 0; process 0 writes the run folder, evaluates and prints."""
     episodes: int | None = None
-    """Episodes of each scenario after the training; default: its own number, on a plant outside JAX (gym:, fmu:) as
-    many as take no longer than the learning did."""
+    """Episodes of each scenario in the evaluation after the training; default: the scenario's own number.
+    On a plant outside JAX (gym:, fmu:) the default is as many as take no longer than the training."""
     tensorboard: bool = False
-    """Write the metrics as TensorBoard events too, beside metrics.jsonl; needs the extra `tensorboard`."""
+    """Also write the metrics as TensorBoard events; needs the extra `tensorboard`."""
     dry_run: bool = False
-    """Print configuration, shapes, memory and arithmetic, and end before any work."""
+    """Print configuration, shapes, memory and arithmetic, and exit before any training."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
     list: bool = False
-    """Print plants, presets, scenarios and policies, and end."""
+    """Print plants, presets, scenarios, agents and policies, and exit."""
 
 
 def parse(arguments: list[str]) -> Options:
-    """The options; agent, plant and preset are read first, since they set the defaults of all others."""
+    """Parse the options; agent, plant and preset are read first, as they set the defaults of the others."""
     program = "python -m jaxouter.train"
     named = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     named.add_argument("--agent")
@@ -110,9 +109,9 @@ def parse(arguments: list[str]) -> Options:
         )
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
-                "--resume takes no other option but a plant or an agent of your own, --devices, --coordinator, "
-                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug: the run folder holds "
-                "them all"
+                "--resume takes no other options than your own plant or agent, --devices, --coordinator, "
+                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug; the run folder holds "
+                "the rest"
             )
         run = Run.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
@@ -148,7 +147,7 @@ def main(arguments: list[str] | None = None) -> None:
             progress.phase("preparing")
             config = config if options.resume is not None else chosen(config)
             resources(config).check()
-            Fleet.of(config)  # what is left of the checks, before anything is written
+            Fleet.of(config)  # the last checks before anything is written
             path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
             run = Run(Path(path), config)
             devices.text_from_first(lambda: stack.enter_context(lock(run.path)) or "")
@@ -163,9 +162,9 @@ def main(arguments: list[str] | None = None) -> None:
                 kept = f"; what was learned is in {run.path}" if run.path.exists() else ""
                 raise ValueError(f"{error}{kept}") from error
             except (OSError, NotFiniteError) as error:
-                saved = f"what was saved before is whole, {go_on(run)}" if run.path.exists() else "nothing was saved"
+                saved = f"what was saved before is intact, {go_on(run)}" if run.path.exists() else "nothing was saved"
                 raise SystemExit(f"error: {error}; {saved}") from None
-            except KeyboardInterrupt:  # the second one, or after the training
+            except KeyboardInterrupt:  # the second Ctrl-C, or one after the training
                 finals = None
     if finals is None:
         if devices.is_first():
@@ -174,7 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def chosen(config: TrainConfig) -> TrainConfig:
-    """The configuration with what depends on the plant chosen, and told."""
+    """Choose and print the plant-dependent settings of the configuration."""
 
     def choice() -> str:
         found = choose(config)
@@ -188,19 +187,19 @@ def chosen(config: TrainConfig) -> TrainConfig:
 
 
 def go_on(run: Run) -> str:
-    """How to."""
-    return f"go on with: python -m jaxouter.train --resume {run.path}"
+    """How to resume the run."""
+    return f"resume with: python -m jaxouter.train --resume {run.path}"
 
 
 def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainState] | None:
-    """Train with progress, until the end or a signal."""
+    """Train with progress, to the end or until a signal."""
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
     for name, low, high in config.randomise:
-        progress.print(f"each plant has its own {name}, from {low:g} to {high:g}")
+        progress.print(f"{name} is drawn from {low:g} to {high:g}")
     if devices.is_first():
         for change in run.changes() if options.resume is not None else ():
-            print(f"warning: {change}: the run may end otherwise than it would have", file=sys.stderr)
+            print(f"warning: {change}: results may differ from those of an uninterrupted run", file=sys.stderr)
     begun, first = time.perf_counter(), scenarios.reported(config.plant)[0]
 
     @cache
@@ -208,7 +207,7 @@ def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainStat
         return scenarios.get(first, pace.affordable([first], 1, WATCHING * (time.perf_counter() - begun)))
 
     def watch(trainer: Trainer, state: TrainState) -> dict[str, float]:
-        # With the single outputs only because the report asks for them too, in the same compiled function.
+        # The members are recorded only to share a compiled function with the report, which needs them.
         traces = rollout(trainer.policy, trainer.policy_params(state), watched(), record_members=True)
         return {"mae": mae(traces)}
 
@@ -216,12 +215,12 @@ def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainStat
     stopping = cli.Interrupt("what runs now ends, then everything is saved")
     with stopping as interrupt, closing(tensorboard.Events(run)) as events:
 
-        def heard(seed: int, row: Row) -> None:
+        def on_row(seed: int, row: Row) -> None:
             shown.epoch(seed, row)
             if options.tensorboard:
                 events(seed, row)
 
-        finals = train(run, watch, heard, lambda: interrupt.requested, shown.pretrained, shown.begins)
+        finals = train(run, watch, on_row, lambda: interrupt.requested, shown.pretrained, shown.begins)
     if finals is not None:
         shown.end()
     devices.part()
@@ -229,14 +228,14 @@ def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainStat
 
 
 class Learning:
-    """Shows a training: one bar over the gradient steps of all seeds, and the MAE so far of each."""
+    """Shows a training: one bar over the gradient steps of all seeds, and the current MAE of each."""
 
     def __init__(self, progress: Progress, config: TrainConfig, plant: Plant, watched: str) -> None:
-        """Args: watched: id of what the MAE is of."""
+        """Args: watched: id of the scenario of the MAE."""
         self._progress, self._config, self._plant, self._watched = progress, config, plant, watched
         start, updates = config.pretraining.gradient_steps, config.total_updates
         self._gradient_steps = config.seeds * (start + updates)
-        # A gradient step of the pretraining and an update differ in their work only where there are both.
+        # Weights matter only if there are both gradient steps of the pretraining and updates.
         self._weights = arithmetic(config) if start and updates else (1.0, 1.0)
         self._work = config.seeds * sum(n * w for n, w in zip((start, updates), self._weights, strict=True))
         self._done: dict[int, tuple[int, int]] = dict.fromkeys(range(config.seed, config.seed + config.seeds), (0, 0))
@@ -245,7 +244,7 @@ class Learning:
         progress.phase(self._what, self._work)
 
     def begins(self, what: str, done: int, of: int) -> None:
-        """What is going on before gradient steps; so much of it is done."""
+        """A phase before the gradient steps, and its progress; see `Say`."""
         if what != self._what:
             slow = counter([self._plant])
             if slow is not None and what == "recording":
@@ -258,7 +257,7 @@ class Learning:
         self._progress.say(pieces=f"{done} of {of} plants" if of > 1 else "")
 
     def pretrained(self, seed: int, at: PretrainingState, look: Callable[[], Row]) -> None:
-        """So far is the pretraining; the MAE is looked at now and then, where that is quick, else the cost is shown."""
+        """Progress of the pretraining: now and then the MAE, if quick to evaluate, else the cost on the model."""
         if self._plant.differentiable:
             if self._pace.due():
                 self._maes[seed] = cli.number(self._pace.do(look)["mae"])
@@ -267,7 +266,7 @@ class Learning:
         self._reached(seed, int(at.done), 0)
 
     def epoch(self, seed: int, row: Row) -> None:
-        """An epoch has ended; the start counts as one."""
+        """An epoch has ended; the pretraining counts as epoch 0."""
         self._maes[seed] = cli.number(row["mae"])
         for name, what in (("skipped", "updates skipped"), ("no_action", "actions not finite")):
             self._progress.say(**{name: f"{row[name]:.1%} of the {what}" if row.get(name) else ""})
@@ -284,7 +283,7 @@ class Learning:
         )
 
     def end(self) -> None:
-        """A line that stays, where something has been learned."""
+        """Print a final line if anything was learned."""
         steps = sum(map(sum, self._done.values()))
         if steps:
             took = clock(time.monotonic() - self._begun)

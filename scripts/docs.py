@@ -1,11 +1,11 @@
-"""Run the code blocks of the documentation as they stand, each page in a copy of this checkout of its own.
+"""Run the code blocks of the documentation, each page in a fresh copy of this checkout.
 
     python scripts/docs.py                             # all pages of docs
     python scripts/docs.py docs/tutorial.md            # one of them
 
-Blocks of `bash` and `python` are run in their order, in one process a page: the Python blocks share a namespace, a Bash
-block ends at the first command that fails. All others are only shown, and so is a block below a comment
-`<!-- not run: WHY -->`. Ends with status 1 if a page fails; its other blocks are then not run, other pages are.
+Blocks of `bash` and `python` run in order, in one process per page. Python blocks share a namespace; a Bash block ends
+at the first command that fails. Blocks in other languages, and those below a comment `<!-- not run: WHY -->`, are not
+run. If a block fails, the rest of its page is skipped, other pages still run, and the exit status is 1.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RUN = ("bash", "python")
 
 @dataclass(frozen=True)
 class Options:
-    """Run the code blocks of the documentation, each page in a copy of this checkout."""
+    """Run the code blocks of the documentation, each page in a fresh copy of this checkout."""
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Markdown files of this checkout; default: all in docs."""
@@ -45,12 +45,12 @@ class Block(NamedTuple):
 
     language: str
     text: str
-    line: int  # where its text begins, from 1
-    why_not: str  # '' where it is run
+    line: int  # first line of its text, from 1
+    why_not: str  # why it is not run; '' if it is
 
 
 class Outcome(NamedTuple):
-    """What became of a page."""
+    """The result of a page."""
 
     run: int
     minutes: float
@@ -77,10 +77,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def inside(page: Path) -> Path:
-    """The page, from the root of the checkout.
+    """The page's path relative to the root of the checkout.
 
     Raises:
-        ValueError: it is no file of the checkout.
+        ValueError: it is not a file of the checkout.
     """
     path = page.resolve()
     if not (path.is_file() and path.is_relative_to(ROOT)):
@@ -89,7 +89,7 @@ def inside(page: Path) -> Path:
 
 
 def blocks(markdown: str) -> list[Block]:
-    """The blocks of a page in Bash and Python."""
+    """The Bash and Python blocks of a page."""
     found = []
     for match in FENCE.finditer(markdown):
         why_not = NOT_RUN.search(markdown, 0, match.start())
@@ -100,7 +100,7 @@ def blocks(markdown: str) -> list[Block]:
 
 
 def program(page: Path, found: Sequence[Block]) -> str:
-    """Python that runs the blocks of a page; tracebacks name its lines."""
+    """A Python program that runs the blocks of a page; tracebacks name the page's lines."""
     lines = ["import subprocess", 'names = {"__name__": "__main__"}']
     for block in found:
         where = f"{page}:{block.line}"
@@ -118,7 +118,7 @@ def program(page: Path, found: Sequence[Block]) -> str:
 
 
 def outcome(page: Path, found: Sequence[Block], place: Path) -> Outcome:
-    """Run a page in a copy of its own, with results of baselines and compiled functions kept from page to page only."""
+    """Run a page in a fresh copy; only the cache of baselines and compiled functions is shared between pages."""
     print(f"== {page}", flush=True)
     copy, begun = place / "checkout", time.monotonic()
     copied(copy)
@@ -136,7 +136,7 @@ def outcome(page: Path, found: Sequence[Block], place: Path) -> Outcome:
 
 
 def copied(copy: Path) -> None:
-    """Make a copy of the checkout: what git knows of, and what is new and not ignored."""
+    """Copy the checkout: files tracked by git, and new ones that are not ignored."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -145,7 +145,7 @@ def copied(copy: Path) -> None:
         text=True,
     )
     for name in filter(None, listing.stdout.split("\0")):
-        if (ROOT / name).is_file():  # else it is deleted, and not yet committed
+        if (ROOT / name).is_file():  # else its deletion is not committed yet
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, copy / name)
 

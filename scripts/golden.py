@@ -1,11 +1,11 @@
-"""Golden results: short trainings, exports and a comparison, as they were before the code was last restructured.
+"""Golden results: short trainings, exports and a comparison, as before the last restructuring of the code.
 
-    python scripts/golden.py            # compares with tests/golden.json; status 1 where something differs
-    python scripts/golden.py --write    # makes that file anew
-    python scripts/golden.py --only heaters-td3    # of the trainings this one, and what is made of it
+    python scripts/golden.py            # compares with tests/golden.json; status 1 if anything differs
+    python scripts/golden.py --write    # writes that file again
+    python scripts/golden.py --only heaters-td3    # only this training and what depends on it
 
-Every array is kept as its hash and a few of its elements. On the kind of machine and the version of jaxlib that wrote
-the file the hashes must agree, which is equality to the last bit; elsewhere the elements must, to a small tolerance.
+The file holds a hash and a few elements of every array. On the same kind of machine and version of jaxlib the hashes
+must agree (equality to the last bit); elsewhere the elements must agree to a small tolerance.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from jaxouter import compare, export, train  # before JAX, whose messages it sets
+from jaxouter import compare, export, train  # before JAX, as it configures JAX's messages
 
 # isort: on
 import jax
@@ -34,7 +34,7 @@ from jaxouter.training.trainer import build
 
 FILE = Path(__file__).resolve().parent.parent / "tests" / "golden.json"
 ELEMENTS = 16  # of each array, evenly spaced
-TOLERANCE = 0.05  # of the largest of them, on other machines: 50 steps of Adam amplify rounding
+TOLERANCE = 0.05  # relative to the largest of them, on other machines: 50 steps of Adam amplify rounding
 PAPER = ["--preset", "paper", "--steps", "205", "--epoch", "5"]  # five updates
 DEFAULT = ["--pretraining.gradient-steps", "50"]
 TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--agent.prefill", "640", "--epoch", "400"]
@@ -80,7 +80,7 @@ def machine() -> dict[str, str]:
 
 
 def results(folder: Path, only: tuple[str, ...]) -> dict[str, Any]:
-    """Results by name; all, unless only those of some trainings are asked for."""
+    """Results by name; `only` selects some trainings."""
     found: dict[str, Any] = {}
     for plant in ("pitch", "heaters"):
         for name, options in (("paper", PAPER), ("default", DEFAULT), ("td3", TD3)):
@@ -107,7 +107,7 @@ def results(folder: Path, only: tuple[str, ...]) -> dict[str, Any]:
 
 
 def trained(path: Path) -> dict[str, Any]:
-    """Initial weights, all that a run has changed, and its figures of merit."""
+    """Initial weights, final state and metrics of a run."""
     run = Run.open(path)
     state, _ = run.load(0)
     trainer, params = build(preset(run.config.plant, run.config.preset))
@@ -134,7 +134,7 @@ def array(x: Any) -> dict[str, Any]:
 
 
 def numbers(content: Any, keys: tuple[str, ...]) -> Any:
-    """These keys of a JSON file, without what is a path or a time."""
+    """These keys of a JSON file, without paths and times."""
 
     def of(value: Any) -> Any:
         if isinstance(value, dict):
@@ -145,7 +145,7 @@ def numbers(content: Any, keys: tuple[str, ...]) -> Any:
 
 
 def differences(wanted: Any, found: Any, exact: bool, name: str = "") -> list[str]:
-    """What differs, by name."""
+    """Differences, by name."""
     if isinstance(wanted, dict) and isinstance(found, dict) and set(wanted) == set(found):
         if "elements" in wanted and not exact:
             pair = np.array([wanted["elements"], found["elements"]])

@@ -1,9 +1,9 @@
-"""Break the code on purpose, in ten places, and see whether the tests notice.
+"""Mutation test: break the code on purpose, in ten places, and see whether the tests notice.
 
     python scripts/mutants.py          # writes benchmarks/results/mutants.md; about ten minutes
 
-Each change is made in a copy of the repository. Of the suite the files named with it run there: what fails in them
-fails in the whole. A change that no test notices ends this with status 1.
+Each change is made in a copy of the repository, where only the test file named with it is run. The exit status is 1 if
+no test notices a change.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ MUTANTS = (
 
 
 def failing(mutant: Mutant, broken: bool = True) -> str | None:
-    """The first test that fails with it, or without the change; None: none does.
+    """The first test that fails with the change (`broken` False: without it); None: none fails.
 
     Raises:
-        RuntimeError: the code that it breaks is not there, or not there once.
+        RuntimeError: the code to break is not there exactly once.
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
@@ -114,7 +114,7 @@ def failing(mutant: Mutant, broken: bool = True) -> str | None:
 
 
 def main(out: Path = RESULTS) -> None:
-    """Break each place in turn, and write what noticed it."""
+    """Break each place in turn, and write which test noticed."""
     rows, whole = [], set()
     for mutant in MUTANTS:
         if mutant.tests not in whole:

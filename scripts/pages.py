@@ -1,6 +1,6 @@
-"""What the site takes from elsewhere, by hooks of mkdocs.yml: pictures and tables of benchmarks/results, `--help`.
+"""Generated content of the site, by hooks in mkdocs.yml: figures and tables of benchmarks/results, and `--help`.
 
-Nothing of it is kept twice: what a page shows is made when the site is built.
+It is made when the site is built, so nothing is stored twice.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ PRESETS = ("paper", "default")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """The pictures as results/NAME.png, and the page of the commands."""
+    """Add the figures as results/NAME.png, and the page of the commands."""
     for path in sorted(RESULTS.glob("*.png")):
         files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
     files.append(File.generated(config, "reference/commands.md", content=commands()))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """`{{ results }}` becomes the table of the paper's test cases, `{{ mae of POLICY on SCENARIO }}` a figure."""
+    """Replace `{{ results }}` by the table of the paper's test cases, `{{ mae of POLICY on SCENARIO }}` by a number."""
     del page, config, files
     with_table = re.sub(r"\{\{ results \}\}", lambda _: results(), markdown)
     return re.sub(r"\{\{ (\w+) of (\w+)\s+on\s+(\S+) \}\}", lambda match: figure(*match.groups()), with_table)
 
 
 class Comments(griffe.Extension):
-    """Fields and constants are described by the comment at the end of their line: in the reference it is shown."""
+    """Shows the comment at the end of the line of a field or constant as its description in the reference."""
 
     def on_attribute(self, *, attr: griffe.Attribute, **_: Any) -> None:
-        """Take the comment for the docstring, where there is none."""
+        """Use the comment as docstring if there is none."""
         comment = attr.lines[-1].partition("  # ")[2] if attr.lines else ""
         if attr.docstring is None and comment and not comment.startswith(("type:", "noqa")):
             attr.docstring = griffe.Docstring(comment, parent=attr)
 
 
 def commands() -> str:
-    """What each command says of itself."""
+    """The page with the `--help` of each command."""
     names = [path.stem for path in sorted((ROOT / "jaxouter").glob("*.py")) if "cli.run(main)" in path.read_text()]
     parts = [f"## {name}\n\n```text\n{usage(name)}\n```\n" for name in names]
     return (
@@ -76,7 +76,7 @@ def usage(name: str) -> str:
 
 
 def results() -> str:
-    """The paper's test cases: MAE in the paper and here, median (least to greatest) of the seeds."""
+    """Table of the paper's test cases: MAE in the paper and here, as median (least to greatest) over the seeds."""
     lines = [
         "| test case | inner loop alone | static prefilter | the paper's DRL | `--preset paper` | `default` |",
         "|---|---|---|---|---|---|",
@@ -85,7 +85,7 @@ def results() -> str:
 
 
 def rows(plant: str) -> Iterator[list[str]]:
-    """Those of a plant."""
+    """Rows of a plant."""
     kept = {preset: json.loads((RESULTS / f"{plant}-{preset}.json").read_text())["results"] for preset in PRESETS}
     for name in scenarios.reported(plant):
         published = scenarios.get(name, 1).paper
@@ -99,15 +99,15 @@ def rows(plant: str) -> Iterator[list[str]]:
 
 @cache
 def compared(plant: str) -> list[dict[str, str]]:
-    """The rows of the comparison of a plant."""
+    """Rows of a plant's comparison."""
     return list(csv.DictReader((RESULTS / f"compare-{plant}.csv").read_text().splitlines()))
 
 
 def figure(merit: str, policy: str, scenario: str) -> str:
-    """A figure of merit in the comparison, median of the seeds.
+    """A metric in the comparison, median over the seeds.
 
     Raises:
-        ValueError: there is none.
+        ValueError: it is not in the comparison.
     """
     kept = compared(scenario.split("/")[0])
     values = [float(row[merit]) for row in kept if (row["policy"], row["scenario"]) == (policy, scenario)]
@@ -117,7 +117,7 @@ def figure(merit: str, policy: str, scenario: str) -> str:
 
 
 def maes(kept: list[dict[str, Any]], policy: str, scenario: str) -> list[float]:
-    """MAE of each run of a policy."""
+    """MAE of each run of a policy on a scenario."""
     return [run["scenarios"][scenario]["mae"] for run in kept if run["policy"] == policy]
 
 

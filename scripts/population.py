@@ -1,4 +1,4 @@
-"""A large population of houses on several devices, under the static prefilter: how fast, how much memory, how well.
+"""Simulate a large population of houses on several devices under the static prefilter; prints speed, memory and MAE.
 
 python scripts/population.py --houses 10000000 --devices 2 --hours 200
 """
@@ -25,25 +25,25 @@ from jaxouter.training.devices import Processes, connect, spread
 
 @dataclass(frozen=True)
 class Options:
-    """Options of this script."""
+    """Simulate a large population of houses on several devices, under the static prefilter."""
 
     houses: int = 10_000_000
     """Houses, a multiple of the devices."""
     devices: int = 1
-    """Devices over which they are spread."""
+    """Devices to split them over."""
     hours: int = 200
     """Length of the run."""
     law: Law = "euler-maruyama"
     """How the noise of an hour is drawn."""
     r: float = 20.0
-    """Set-point of their mean temperature, degC."""
+    """Set-point of the mean temperature, degC."""
     seed: int = 0
-    """Of starts and noise."""
+    """Seed of starts and noise."""
 
 
 @partial(jax.jit, static_argnums=(0, 4))
 def run(plant: Plant, params: Any, r_tilde: jax.Array, key: chex.PRNGKey, hours: int) -> tuple[jax.Array, jax.Array]:
-    """Mean temperature (hours,), and in each hour the share of houses that moved by more than the comfort limit."""
+    """Mean temperature (hours,), and the share of houses that moved by more than the comfort limit in each hour."""
     key_start, key_run = jax.random.split(key)
     limit = plant.rate_limit or jnp.inf
 
@@ -60,7 +60,7 @@ def main() -> None:
     options = tyro.cli(Options)
     with cli.user_errors():
         connect(options.devices, Processes())
-        base = steady_state.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # from four houses
+        base = steady_state.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # of four houses
         plant, params = plants.make("heaters", n=options.houses, law=options.law)
         params = spread(params, options.houses, options.devices)
     r_tilde = jnp.clip(base.offset + base.slope * options.r, *plant.r_tilde_bounds)

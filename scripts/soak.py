@@ -1,11 +1,11 @@
-"""Kill a training run at random moments, go on each time, and compare the end with that of a run nobody disturbed.
+"""Kill a training run at random moments, resume it each time, and compare its end with that of an undisturbed run.
 
     python scripts/soak.py                  # 20 kills; writes benchmarks/results/soak.json
     python scripts/soak.py --kills 3 --out /tmp/soak.json
 
-The run has two seeds, each with pretraining, prefill and epochs of DDPG. It is killed by SIGKILL, anywhere from its
-first instruction on: while it imports, makes its folder, records, pretrains, learns or saves. The parameters in the end
-must be equal to the last bit, and so must the metrics but for wall time and rates.
+The run has two seeds, each with pretraining, prefill and epochs of DDPG. SIGKILL may hit at any time: while it imports,
+makes its folder, records, pretrains, learns or saves. The final parameters must be equal to the last bit, and so must
+the metrics, except wall times and rates.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jaxouter.training import checkpoint
 from jaxouter.training.run import Run, surroundings, write_json
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "soak.json"
-TRAINING = (  # of which a piece as long as a start of the process holds some gradient steps and epochs
+TRAINING = (  # so small that some gradient steps and epochs take no longer than the start of the process
     *("heaters", "--pretraining.gradient-steps", "400", "--pretraining.episodes", "8"),
     *("--pretraining.batch-size", "16", "--environments", "8", "--epoch", "800"),
     *("--agent.prefill", "640", "--agent.replay", "40000"),
@@ -39,24 +39,24 @@ TRAINING = (  # of which a piece as long as a start of the process holds some gr
 
 @dataclass(frozen=True)
 class Options:
-    """How often to kill it, and how long it is."""
+    """Kill a training run at random moments, resume it each time, and compare it with an undisturbed one."""
 
     kills: int = 20
-    """How often."""
+    """Number of kills."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the moments."""
     within: float = 8.0
-    """Seconds after a start in which it is killed."""
+    """Longest time from a start to its kill, s."""
     seeds: int = 2
-    """That train side by side."""
+    """Seeds of the training run."""
     steps: int = 400_640
-    """Environment steps of each of them."""
+    """Environment steps of each seed."""
     out: Path = RESULTS
-    """Where the result goes."""
+    """File for the result."""
 
 
 def command(folder: Path, options: Options) -> list[str]:
-    """Begin the run, or go on with it."""
+    """The command that begins or resumes the run."""
     size = ["--seeds", str(options.seeds), "--steps", str(options.steps)]
     start = ["--resume", str(folder)] if folder.exists() else [*TRAINING, *size, "--out", str(folder)]
     return [sys.executable, "-m", "jaxouter.train", *start]
@@ -72,10 +72,10 @@ def where(folder: Path) -> str:
 
 
 def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
-    """Train to the end in spite of so many kills.
+    """Train to the end in spite of the kills.
 
     Raises:
-        RuntimeError: it failed by itself, or came to its end before the last kill.
+        RuntimeError: the training failed by itself, or ended before the last kill.
     """
     draw, moments = random.Random(options.seed), []
     for i in range(options.kills):
@@ -97,7 +97,7 @@ def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
 
 
 def differences(one: Run, other: Run) -> list[str]:
-    """What is not the same in two runs: checkpoints, rows of the metrics, files."""
+    """Differences between two runs: checkpoints, rows of the metrics, files."""
     found = []
     for seed in one.seeds:
         rows = [
@@ -113,10 +113,10 @@ def differences(one: Run, other: Run) -> list[str]:
 
 
 def soak(options: Options) -> dict[str, Any]:
-    """Both runs and what differs.
+    """Do both runs, and compare them.
 
     Raises:
-        RuntimeError: something does.
+        RuntimeError: the runs differ.
     """
     with tempfile.TemporaryDirectory() as folder:
         whole, disturbed = Path(folder) / "whole", Path(folder) / "disturbed"

@@ -1,10 +1,10 @@
-"""What was tried on the way to the presets, and what it gave: benchmarks/results/learning.md.
+"""Train variants of the default preset, and write what each gave to benchmarks/results/learning.md.
 
-    python scripts/sweep.py                             # train what is not there yet, write the table
+    python scripts/sweep.py                             # train what is missing, write the table
     python scripts/sweep.py --seeds 5 --only default
 
-Each line of the table is one command of `python -m jaxouter.train`; its run folder is runs/sweep/PLANT-NAME. The
-columns are the scenarios in which the inner loop alone is stable, the median over the seeds of the MAE.
+Each row of the table is one command of `python -m jaxouter.train`, with run folder runs/sweep/PLANT-NAME. The columns
+are the median MAE over the seeds, for each scenario in which the inner loop alone is stable.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jaxouter.training.run import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
 DDPG_ALONE = ("--pretraining.gradient-steps", "0", "--steps")
-THEN_DDPG = ("--steps", "38000", "--agent.actor-from", "2500")  # 7,500 updates after the start, the actor in two thirds
+THEN_DDPG = ("--steps", "38000", "--agent.actor-from", "2500")  # 7,500 updates; the actor moves in the last two thirds
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
     "500-gradient-steps": ("--pretraining.gradient-steps", "500"),
@@ -44,11 +44,11 @@ class Options:
     """Train every variant on both plants, and write the table of what each gave."""
 
     seeds: int = 2
-    """Seeds of the runs that are not there yet."""
+    """Seeds of new runs."""
     only: tuple[str, ...] = tuple(VARIANTS)
-    """Variants to train; the table has all whose run folder is there."""
+    """Variants to train; the table has all that have a run folder."""
     runs: Path = Path("runs/sweep")
-    """Where the run folders are."""
+    """Folder for the runs."""
 
 
 def selected_on(plant: str) -> list[str]:
@@ -57,7 +57,7 @@ def selected_on(plant: str) -> list[str]:
 
 
 def line(name: str, run: Run) -> list[str]:
-    """Variant, seeds, median MAE of each scenario, and seconds a seed, start included."""
+    """Variant, seeds, median MAE of each scenario, and seconds per seed for the whole command."""
     trainer, _ = run.trainer
     selected = [scenarios.get(identifier) for identifier in selected_on(run.config.plant)]
     policies = [NamedPolicy("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
@@ -68,7 +68,7 @@ def line(name: str, run: Run) -> list[str]:
 
 
 def train(plant: str, name: str, options: Options) -> None:
-    """Run the command, unless its folder is there."""
+    """Run the command, unless its folder exists."""
     folder = options.runs / f"{plant}-{name}"
     if folder.exists():
         return

@@ -82,7 +82,7 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
         "static prefilter",
         "3.90 of 10.91",
         "10.91",
-        "each plant has its own gain, from 0.8 to 1.2",
+        "gain is drawn from 0.8 to 1.2",
         "inside",
     ):
         assert text in done.stdout

@@ -62,7 +62,7 @@ def test_a_full_disk_ends_the_run_with_one_line_and_leaves_the_last_checkpoint_w
     assert done.returncode == 1, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
     assert line.startswith("error: ")
-    assert "what was saved before is whole, go on with: python -m jaxouter.train --resume" in line
+    assert "what was saved before is intact, resume with: python -m jaxouter.train --resume" in line
     assert ("No space left on device" if by == "file system" else "File too large") in line
     assert kept.read_bytes() == before
     assert checkpoint.read(kept)[0]["epoch"] == 1

@@ -42,7 +42,7 @@ def begun(tmp_path_factory):
 @pytest.mark.slow
 def test_it_begins_from_nothing_in_real_time(begun):
     out, folder = begun
-    for text in ("step 0: recording", ": static", "missed deadlines", "us (p99)", "had r passed"):
+    for text in ("step 0: recording", ": static", "missed deadlines", "us (p99)", "r~ = r"):
         assert text in out
     summary = json.loads((folder / "live" / "summary.json").read_text())
     assert summary["steps"] == 500 == sum(summary["counts"].values())
@@ -80,7 +80,7 @@ def test_it_goes_on_where_it_was_and_ends_by_ctrl_c(begun, tmp_path):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert "stopped; saved, go on with the same command" in err
+    assert "stopped; saved, resume with the same command" in err
     summary = json.loads((folder / "live" / "summary.json").read_text())
     assert summary["steps"] == len(rows.read_text().splitlines()) - 1 > 515
     assert summary["counts"]["recording"] < 300  # of the first run alone
@@ -147,8 +147,8 @@ def test_a_module_that_is_importable_is_named_without_py(trained, tmp_path, monk
         ([EXAMPLE, "--run", "x", "--dt", "0"], "--dt is 0.0; it must be a positive number of seconds"),
         ([EXAMPLE, "--run", "x", "--dt", "nan"], "--dt is nan"),
         ([EXAMPLE, "--run", "x", "--dt", "1", "--steps", "0"], "--steps is 0; it must be at least 1"),
-        ([EXAMPLE, "--run", "x", "--dt", "1"], "there is no run x; train one, or begin one from nothing by --learn"),
-        ([EXAMPLE, "--run", "x", "--dt", "1", "--learn"], "takes --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"),
+        ([EXAMPLE, "--run", "x", "--dt", "1"], "there is no run x; train one, or start without one by --learn"),
+        ([EXAMPLE, "--run", "x", "--dt", "1", "--learn"], "needs --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--setpoint-range", "6", "2"], "--setpoint-range is (6.0, 2.0)"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--reference", "zigzag"], "--reference is 'zigzag'; it must be a number"),
         ([EXAMPLE, "--run", "x", *NOTHING, "--reference", "no.csv"], "--reference: no.csv can't be read: No such file"),

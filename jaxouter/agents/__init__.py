@@ -1,4 +1,4 @@
-"""Agents: what a learner is, those that exist, networks, exploration noise, replay. They know nothing of plants."""
+"""Agents: the learner interface, the learners, networks, exploration noise and replay. They know nothing of plants."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxouter.agents.ddpg import DDPGConfig
 __all__ = ["AGENTS", "Agent", "AgentConfig", "OffPolicy", "OnPolicy", "name_of", "resolve"]
 
 AGENTS: dict[str, type[AgentConfig]] = {"ddpg": DDPGConfig}
-"""Settings of every known learner, by its name."""
+"""The settings class of each learner, by name."""
 
 
 def resolve(name: str) -> type[AgentConfig]:
@@ -26,7 +26,7 @@ def name_of(config: AgentConfig) -> str:
     """The name under which the settings are registered.
 
     Raises:
-        ValueError: they are not.
+        ValueError: they are not registered.
     """
     for name, kind in AGENTS.items():
         if kind is type(config):

@@ -1,4 +1,4 @@
-"""Adam with its bias corrections in the step size: one division and one root a weight; optax takes three and one."""
+"""Adam with the bias corrections folded into the step size: one division per weight where optax takes three."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import optax
 class AdamState(NamedTuple):
     """State of `adam`."""
 
-    steps: jax.Array  # int32, so far
+    steps: jax.Array  # int32, steps so far
     mean: Any  # of the gradients, like the parameters
     square: Any  # mean of their squares, like the parameters
 

@@ -1,8 +1,8 @@
-"""What a learner is, and the data it learns from. It knows nothing of plants, files or devices.
+"""The learner interface and the data a learner learns from. A learner knows nothing of plants, files or devices.
 
-Its small functions are unbatched; the drivers in `jaxouter.training` vmap them. Whatever it learns, what acts in the
-end is one MLP, `jaxouter.agents.networks.Actor`, followed by tanh: exports, pretraining, stability analysis and the
-live loop need nothing else of a learner.
+`explore` takes one environment; the drivers in `jaxouter.training` vmap it. Whatever else a learner learns, its policy
+is one MLP, `jaxouter.agents.networks.Actor`, followed by tanh. Exports, pretraining, stability analysis and the live
+loop need nothing else of a learner.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import jax
 
 @dataclass(frozen=True)
 class OffPolicy:
-    """Learns from transitions in a replay, whoever acted."""
+    """Learns from transitions in a replay, whichever policy acted."""
 
     batch_size: int
-    """Transitions an update."""
+    """Transitions per update."""
     n_step: int
-    """Steps of the return before it is bootstrapped."""
+    """Steps of the return before bootstrapping."""
     discount: float
-    """Discount a control step."""
+    """Discount per control step."""
     updates: int
-    """After each step of all environments."""
+    """Updates after each step of all environments."""
     prefill: int
     """Environment steps with random actions before the first update."""
     replay: int
-    """Environment steps that the replay holds."""
+    """Environment steps the replay holds."""
 
     @property
     def before(self) -> int:
@@ -37,11 +37,11 @@ class OffPolicy:
         return self.prefill
 
     def total_updates(self, steps: int, environments: int) -> int:
-        """Updates in so many environment steps, those before the first epoch included."""
+        """Updates in `steps` environment steps, of which the first `prefill` have none."""
         return max(0, steps - self.prefill) // environments * self.updates
 
     def check(self, steps: int, epoch: int, environments: int, shards: int) -> None:
-        """Whether a training of this shape can be.
+        """Check that these settings fit together.
 
         Raises:
             ValueError: names the field, its value and what is allowed.
@@ -68,18 +68,18 @@ class OffPolicy:
 
 @dataclass(frozen=True)
 class OnPolicy:
-    """Learns from what the present policy has just done."""
+    """Learns from what the current policy has just done."""
 
     unroll: int
     """Steps of each environment between updates."""
     epochs: int
-    """Passes over these."""
+    """Passes over these steps."""
     minibatches: int
-    """Parts of each pass, an update each."""
+    """Minibatches per pass, one update each."""
     discount: float
-    """Discount a control step."""
+    """Discount per control step."""
     gae_lambda: float
-    """Decay of advantages (Schulman et al. 2016); 1: the whole return."""
+    """Lambda of generalised advantage estimation (Schulman et al. 2016); 1: the whole return."""
 
     @property
     def before(self) -> int:
@@ -87,11 +87,11 @@ class OnPolicy:
         return 0
 
     def total_updates(self, steps: int, environments: int) -> int:
-        """Updates in so many environment steps."""
+        """Updates in `steps` environment steps."""
         return steps // (self.unroll * environments) * self.epochs * self.minibatches
 
     def check(self, steps: int, epoch: int, environments: int, shards: int) -> None:
-        """Whether a training of this shape can be.
+        """Check that these settings fit together.
 
         Raises:
             ValueError: names the field, its value and what is allowed.
@@ -108,9 +108,9 @@ def _multiple(name: str, value: int, of: int, what: str) -> None:
 
 
 class AgentConfig:
-    """Marks the settings of a learner: a frozen dataclass, whose fields are the options `--agent.*`.
+    """Base class of a learner's settings: a frozen dataclass whose fields become the options `--agent.*`.
 
-    Among them is `hidden`, the widths of the actor's hidden layers.
+    It must have the field `hidden`, the widths of the actor's hidden layers.
     """
 
     hidden: tuple[int, ...]
@@ -121,21 +121,21 @@ class AgentConfig:
         raise NotImplementedError
 
     def check(self) -> None:
-        """Raises ValueError, naming field, value and what is allowed."""
+        """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
 
     def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> Agent:
         """The learner.
 
         Args:
             obs_size: length of an observation.
-            total_updates: of the training, for schedules.
-            axis: mapped axis over which gradients are averaged, where each member updates on its part of the batch.
+            total_updates: updates in the whole training, for schedules.
+            axis: mapped axis over which gradients are averaged: each member updates on its part of the batch.
         """
         raise NotImplementedError
 
 
 class Transitions(NamedTuple):
-    """What an off-policy learner updates from, (B, ...)."""
+    """A batch for an off-policy learner, (B, ...)."""
 
     obs: jax.Array  # (B, n)
     action: jax.Array  # (B, m), in [-1, 1]
@@ -145,11 +145,11 @@ class Transitions(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """What an on-policy learner updates from, (B, ...)."""
+    """A batch for an on-policy learner, (B, ...)."""
 
     obs: jax.Array  # (B, n)
     action: jax.Array  # (B, m), in [-1, 1]
-    extras: Any  # as `explore` gave them
+    extras: Any  # as returned by `explore`
     advantage: jax.Array  # (B,), generalised, not normalised
     value_target: jax.Array  # (B,)
 
@@ -167,15 +167,15 @@ class Agent(Protocol):
         ...
 
     def actor(self, state: Any) -> Any:
-        """Parameters of the one MLP that acts."""
+        """Parameters of the actor network."""
         ...
 
     def with_actor(self, state: Any, actor: Any) -> Any:
-        """The state with another actor, targets and all."""
+        """The state with another actor; its target network is replaced too."""
         ...
 
     def noise(self, environments: int) -> Any:
-        """What exploration remembers, each leaf (E, ...)."""
+        """Initial state of the exploration noise, each leaf (E, ...)."""
         ...
 
     def explore(
@@ -184,15 +184,15 @@ class Agent(Protocol):
         """An action of one environment, with exploration.
 
         Args:
-            state: learner.
-            noise: of this environment.
+            state: of the learner.
+            noise: state of this environment's noise.
             obs: (n,).
-            normal: standard normal numbers (m,), so that none are drawn in the loop.
-            first: bool, whether an episode begins.
-            progress: share of the training that is over.
+            normal: standard normal numbers (m,), drawn outside the loop.
+            first: bool, whether this is the first step of an episode.
+            progress: share of the training that is done.
 
         Returns:
-            action (m,) in [-1, 1], the next noise, and extras: what an on-policy learner wants back beside them.
+            action (m,) in [-1, 1], the next noise, and extras: what else an on-policy learner needs for its update.
         """
         ...
 
@@ -201,21 +201,21 @@ class Agent(Protocol):
         ...
 
     def value(self, state: Any, obs: jax.Array) -> jax.Array:
-        """Discounted return that it expects from obs (..., n) on; (...)."""
+        """Expected discounted return from obs (..., n); (...)."""
         ...
 
 
 class OffPolicyAgent(Agent, Protocol):
-    """What the off-policy driver and the live loop need beside that."""
+    """What the off-policy driver and the live loop need in addition."""
 
     def diagnose(self, state: Any, batch: Transitions, key: chex.PRNGKey) -> dict[str, jax.Array]:
-        """What tells on one batch whether the learning is sound, such as norms of gradients."""
+        """Diagnostics on one batch, such as gradient norms."""
         ...
 
     def endless(self, warm_up: int) -> OffPolicyAgent:
-        """The same learner for a loop without end, whose actor stays as it is for so many updates."""
+        """The same learner for a loop without end; its actor is frozen for the first `warm_up` updates."""
         ...
 
     def restarted(self, state: Any) -> Any:
-        """The same networks, with targets, optimisers and counters anew."""
+        """The same networks, with fresh targets, optimisers and counters."""
         ...

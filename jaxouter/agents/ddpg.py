@@ -1,6 +1,6 @@
-"""Deep deterministic policy gradient, functional; TD3's three tricks are settings of the same learner.
+"""Deep deterministic policy gradient in functional style; TD3's three tricks are settings of the same learner.
 
-One transition is unbatched in the small functions; `update` vmaps them over a batch.
+Small functions take one transition; `update` vmaps them over a batch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxouter.agents.noise import ornstein_uhlenbeck
 
 @dataclass(frozen=True)
 class DDPGConfig(AgentConfig):
-    """Settings of the learner; the defaults are the paper's (and Lillicrap's where the paper is silent)."""
+    """Settings of the learner; defaults are the paper's, or Lillicrap's where the paper gives none."""
 
     hidden: tuple[int, ...] = (400, 300)
     """Widths of the hidden layers of actor and critic; at least two."""
@@ -32,41 +32,41 @@ class DDPGConfig(AgentConfig):
     critic_rate: float = 1e-3
     """Learning rate of the critic (Adam)."""
     rate_decay: Literal["constant", "cosine"] = "constant"
-    """How both learning rates fall over the training; cosine ends at zero."""
+    """Schedule of both learning rates over the training; cosine ends at zero."""
     critic_l2: float = 1e-2
-    """L2 penalty on the critic's weights (half its square is added to the loss)."""
+    """L2 penalty on the critic's weights: half this times their squared norm is added to the loss."""
     batch_size: int = 64
-    """Transitions an update."""
+    """Transitions per update."""
     discount: float = 0.99
-    """Discount a control step (the paper's gamma)."""
+    """Discount per control step (the paper's gamma)."""
     polyak: float = 0.001
-    """Share of the networks that goes into the targets at each update (the paper's tau)."""
+    """Step of the target networks towards the networks at each update (the paper's tau)."""
     n_step: int = 1
-    """Steps of the return before it is bootstrapped."""
+    """Steps of the return before bootstrapping."""
     saturation_penalty: float = 0.0
-    """Weight of the mean square of the actor's output before its tanh, against saturation."""
+    """Penalty on the mean square of the actor's output before its tanh, to avoid saturation."""
     critics: Literal[1, 2] = 1
-    """TD3: two critics, the smaller value is the target."""
+    """TD3: with two critics, the target takes the smaller value."""
     policy_delay: int = 1
-    """TD3: the actor and the targets move at every so many critic updates."""
+    """TD3: critic updates per update of the actor and the targets."""
     actor_from: int = 0
-    """Updates of the critic alone before the actor moves too: a critic that knows nothing would spoil a good actor."""
+    """Updates of the critic alone before the actor's first: an untrained critic would spoil a good actor."""
     target_noise: float = 0.0
     """TD3: standard deviation of the noise on the target action."""
     target_noise_clip: float = 0.5
-    """TD3: largest such noise."""
+    """TD3: bound on that noise."""
     updates: int = 1
     """Updates after each step of all environments; updates / environments is the update-to-data ratio."""
     prefill: int = 1_000
-    """Environment steps with random actions, each held a while, before the first update."""
+    """Environment steps with random actions, each held for a while, before the first update."""
     replay: int = 1_000_000
-    """Environment steps that the replay holds."""
+    """Environment steps the replay holds."""
     noise_theta: float = 0.15
-    """Rate of return of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
+    """Mean reversion rate of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
     noise_sigma: tuple[float, float] = (0.2, 0.2)
-    """Its volatility in the first and the last environment, geometric in between; 1 is half the range of r~."""
+    """Volatility of that noise in the first and the last environment, geometric in between; 1 is half the r~ range."""
     noise_end: float = 1.0
-    """Factor on the volatility at the end of training, reached linearly."""
+    """Factor on the volatility at the end of the training; it changes linearly from 1."""
 
     @property
     def data(self) -> OffPolicy:
@@ -78,7 +78,7 @@ class DDPGConfig(AgentConfig):
         return DDPG(self, obs_size, total_updates=total_updates, axis=axis)
 
     def check(self) -> None:
-        """Raises ValueError, naming field, value and what is allowed."""
+        """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
         positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay", "updates")
         not_negative = ("critic_l2", "saturation_penalty", "actor_from", "target_noise", "target_noise_clip")
         for field in positive:
@@ -107,14 +107,14 @@ class DDPGConfig(AgentConfig):
 
 
 class Noise(NamedTuple):
-    """What exploration remembers, of one environment or of all."""
+    """State of the exploration noise, of one environment or of all."""
 
     x: jax.Array  # Ornstein-Uhlenbeck process
-    sigma: jax.Array  # its volatility at the beginning of the training
+    sigma: jax.Array  # its volatility at the start of the training
 
 
 class DDPGState(NamedTuple):
-    """Everything that learning changes."""
+    """State of the learner."""
 
     actor: Any
     critics: tuple[Any, ...]
@@ -126,7 +126,7 @@ class DDPGState(NamedTuple):
 
 
 def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
-    """G = R + discount Q'(s', mu'(s')), with the least of the target critics (paper eq. 4).
+    """G = R + discount Q'(s', mu'(s')), with the smallest value of the target critics (paper eq. 4).
 
     Args:
         reward, discount: scalars; the discount is 0 where terminated.
@@ -136,13 +136,13 @@ def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.
 
 
 def where(condition: jax.Array, tree: Any, other: Any) -> Any:
-    """Leaf by leaf the one or the other."""
+    """`tree` if the condition holds, else `other`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree, other)
 
 
 @dataclass(frozen=True)
 class DDPG:
-    """The learner for observations of `obs_size` numbers. Static and hashable; its state is a pytree."""
+    """The learner for observations of size `obs_size`. Static and hashable; its state is a pytree."""
 
     config: DDPGConfig
     obs_size: int
@@ -168,7 +168,7 @@ class DDPG:
         return Critic(self.config.hidden, self.config.layer_norm)
 
     def _average(self, found: tuple[jax.Array, Any]) -> tuple[jax.Array, Any, jax.Array]:
-        """Over all parts of the batch: loss, zero where it is not finite, gradient, and whether the loss is finite."""
+        """Loss (0 if not finite) and gradient, averaged over all parts of the batch, and whether the loss is finite."""
         loss, gradient = found if self.axis is None else jax.lax.pmean(found, self.axis)
         finite = jnp.isfinite(loss)
         return jnp.where(finite, loss, 0.0), gradient, finite
@@ -198,7 +198,7 @@ class DDPG:
         return optax.chain(optax.add_decayed_weights(self.config.critic_l2, kernels), plain)
 
     def init(self, key: chex.PRNGKey) -> DDPGState:
-        """Random networks, targets equal to them."""
+        """Random networks, and targets equal to them."""
         key_actor, *key_critics = jax.random.split(key, 1 + self.config.critics)
         obs, action = jnp.zeros(self.obs_size), jnp.zeros(self.action_size)
         actor = self.network.init(key_actor, obs)
@@ -206,11 +206,11 @@ class DDPG:
         return self._begin(actor, critics)
 
     def _begin(self, actor: Any, critics: tuple[Any, ...]) -> DDPGState:
-        """With targets, optimisers and counters anew."""
+        """These networks, with fresh targets, optimisers and counters."""
         return DDPGState(
             actor=actor,
             critics=critics,
-            target_actor=jax.tree.map(jnp.copy, actor),  # copies: the state is donated, and no buffer twice
+            target_actor=jax.tree.map(jnp.copy, actor),  # copies: the state is donated, and no buffer may be twice
             target_critics=jax.tree.map(jnp.copy, critics),
             actor_optimiser=self.actor_optimiser.init(actor),
             critic_optimiser=self.critic_optimiser.init(critics),
@@ -218,7 +218,7 @@ class DDPG:
         )
 
     def restarted(self, state: DDPGState) -> DDPGState:
-        """The same networks, with targets, optimisers and counters anew."""
+        """The same networks, with fresh targets, optimisers and counters."""
         return self._begin(state.actor, state.critics)
 
     def actor(self, state: DDPGState) -> Any:
@@ -226,16 +226,16 @@ class DDPG:
         return state.actor
 
     def with_actor(self, state: DDPGState, actor: Any) -> DDPGState:
-        """The state with another actor, its target too."""
+        """The state with another actor; its target network is replaced too."""
         return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
 
     def endless(self, warm_up: int) -> DDPG:
-        """The same learner for a loop without end, whose actor stays as it is for so many updates."""
+        """The same learner for a loop without end; its actor is frozen for the first `warm_up` updates."""
         config = replace(self.config, n_step=1, rate_decay="constant", actor_from=warm_up)
         return DDPG(config, self.obs_size, self.action_size)
 
     def noise(self, environments: int) -> Noise:
-        """Zero, with volatilities from the first environment to the last."""
+        """Zero noise, with the volatility of each environment."""
         low, high = self.config.noise_sigma
         sigma = jnp.geomspace(low, high, environments) if environments > 1 else jnp.full(1, high)
         return Noise(jnp.zeros(environments), sigma)
@@ -243,7 +243,7 @@ class DDPG:
     def explore(
         self, state: DDPGState, noise: Noise, obs: jax.Array, normal: jax.Array, first: jax.Array, progress: jax.Array
     ) -> tuple[jax.Array, Noise, tuple[()]]:
-        """mu(s) and Ornstein-Uhlenbeck noise, which begins anew with each episode; see `Agent.explore`."""
+        """mu(s) plus Ornstein-Uhlenbeck noise that restarts with each episode; see `Agent.explore`."""
         sigma = noise.sigma * (1.0 + (self.config.noise_end - 1.0) * progress)
         x = ornstein_uhlenbeck(jnp.where(first, 0.0, noise.x), normal[0], self.config.noise_theta, sigma)
         return jnp.clip(self.act(state.actor, obs) + x[None], -1.0, 1.0), noise._replace(x=x), ()
@@ -276,15 +276,15 @@ class DDPG:
         """One gradient step of critic, actor and targets (paper eq. 2 to 5, algorithm 1).
 
         Args:
-            state: learner.
+            state: of the learner.
             batch: transitions (B, ...).
             key: for TD3's target noise.
-            norms: report norms of the gradients too, for which each is read once more.
+            norms: also report the norms of the gradients, which costs another pass over each.
 
         Returns:
-            The next state; and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99) and skipped: 1
-            where a loss is not finite: what it would have moved, and the targets, stay, and it counts as zero. With
-            `norms` also critic_gradient and actor_gradient.
+            The next state, and scalars critic_loss, actor_loss, q, saturation (share of |action| > 0.99) and skipped.
+            skipped is 1 where a loss is not finite; it is then reported as zero, and neither its network nor the
+            targets are updated. With `norms` also critic_gradient and actor_gradient.
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 
 def dense(features: int, fan_in: int, limit: float | None = None, **rest: Any) -> nn.Dense:
-    """A dense layer, weights and biases uniform in plus or minus `limit` (None: 1/sqrt(fan_in)); `rest` as in flax."""
+    """A dense layer; weights and biases uniform within +- `limit` (None: 1/sqrt(fan_in)); `rest` goes to flax."""
     bound = fan_in**-0.5 if limit is None else limit
 
     def uniform(key: jax.Array, shape: Sequence[int], dtype: Any = float) -> jax.Array:
@@ -21,7 +21,7 @@ def dense(features: int, fan_in: int, limit: float | None = None, **rest: Any) -
 
 
 class Actor(nn.Module):
-    """mu(s) before its tanh."""
+    """The policy mu(s) without its final tanh."""
 
     hidden: tuple[int, ...]
     actions: int
@@ -36,7 +36,7 @@ class Actor(nn.Module):
 
 
 def act(hidden: tuple[int, ...], actor: Any, obs: jax.Array) -> jax.Array:
-    """Action of an actor of one action: its tanh, obs (..., n) -> (..., 1) in [-1, 1]."""
+    """Action of an actor with one output: obs (..., n) -> (..., 1) in [-1, 1]."""
     return jnp.tanh(cast(jax.Array, Actor(hidden, 1).apply(actor, obs)))
 
 
@@ -51,7 +51,7 @@ class Critic(nn.Module):
         """Obs (..., n), action (..., actions) -> Q (...)."""
         x = obs
         for i, features in enumerate(self.hidden):
-            if i == 1:  # weights of their own: the gradient in the action then costs no pass through the first layer
+            if i == 1:  # separate weights: the gradient in the action then skips the first layer
                 fan_in = x.shape[-1] + action.shape[-1]
                 x = dense(features, fan_in)(x) + dense(features, fan_in, use_bias=False, name="action")(action)
             else:

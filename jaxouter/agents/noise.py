@@ -9,9 +9,9 @@ def ornstein_uhlenbeck(x: jax.Array, normal: jax.Array, theta: float, sigma: jax
     """The next x of an Ornstein-Uhlenbeck process with mean 0 and unit time step; theta = 1 is white noise.
 
     Args:
-        x: present value, any shape.
+        x: current value, any shape.
         normal: standard normal of the same shape.
-        theta, sigma: rate of return and volatility (paper: 0.15, 0.2).
+        theta, sigma: mean reversion rate and volatility (paper: 0.15, 0.2).
 
     Source: Lillicrap et al. 2015, supplement; paper section III-A.
     """

@@ -1,8 +1,8 @@
-"""Replay: a ring of rows for each of E environments, in one float32 array, sampled in windows of consecutive rows.
+"""Replay: one ring buffer of rows per environment, sampled in windows of consecutive rows.
 
-The last rows of the ring stand once more in front of the first, so that every window is one contiguous slice, also
-where the ring wraps around. A row is a record of named fields; the field `age` (steps since the reset) is required: it
-tells which rows of a window belong to one episode.
+All rings share one float32 array. The last rows of a ring are mirrored in front of its first, so that every window is
+one contiguous slice, even where the ring wraps around. A row has named fields. The field `age` (steps since the reset)
+is required: it tells which rows of a window belong to one episode.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Replay:
     """Layout of a replay. Static and hashable."""
 
     fields: tuple[str, ...]
-    """Names of a row's columns."""
+    """Names of the columns."""
     environments: int
     steps: int
-    """Rows kept for each environment."""
+    """Rows kept per environment."""
     lead: int
-    """Rows before the first one of a window that come with it (the history of an observation)."""
+    """Extra rows in front of a window (the history of an observation)."""
     window: int = 1
-    """Rows of a window that may be used as transitions (n of n-step returns)."""
+    """Rows of a window that can be used as transitions (n of n-step returns)."""
 
     def __post_init__(self) -> None:
         if self.steps <= 2 * self.mirror:
@@ -45,7 +45,7 @@ class Replay:
 
     @property
     def mirror(self) -> int:
-        """Rows that stand twice."""
+        """Rows that are stored twice."""
         return self.lead + self.window - 1
 
     def init(self) -> ReplayState:
@@ -54,7 +54,7 @@ class Replay:
         return ReplayState(jnp.zeros(shape, jnp.float32), jnp.zeros((), jnp.int32))
 
     def write(self, state: ReplayState, rows: jax.Array) -> ReplayState:
-        """Add one row (width,) of each environment: rows (E, width)."""
+        """Add one row per environment: rows (E, width)."""
         chex.assert_shape(rows, (self.environments, len(self.fields)))
         slab = rows.astype(jnp.float32)[:, None, :]
         position = state.written % self.steps + self.mirror
@@ -64,9 +64,9 @@ class Replay:
         return ReplayState(buffer, state.written + 1)
 
     def take_back(self, state: ReplayState) -> tuple[ReplayState, jax.Array]:
-        """The state without the rows (E, width) of the last `write`, and these; writing them again gives it back.
+        """Undo the last `write`: the state before it, and its rows (E, width). Writing them again restores the state.
 
-        What `sample` draws from it is what it drew before that `write`.
+        From the returned state, `sample` draws what it drew before that `write`.
         """
         position = (state.written - 1) % self.steps + self.mirror
         rows = jax.lax.dynamic_slice_in_dim(state.rows, position, 1, 1)[:, 0]
@@ -75,27 +75,27 @@ class Replay:
     def sample(self, state: ReplayState, bits: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Windows drawn uniformly, with replacement.
 
-        At least `window` rows must have been written. Once the ring is full, rows whose lead is already overwritten,
-        or will be by the next `write`, are not drawn.
+        At least `window` rows must have been written. Once the ring is full, a row is not drawn if its lead is already
+        overwritten or will be by the next `write`.
 
         Args:
             state: contents.
-            bits: random, (n, 2), uint32, as of `jax.random.bits`: which environments, and which of their rows.
+            bits: (n, 2), uint32, as from `jax.random.bits`; they choose the environments and their rows.
 
         Returns:
-            rows (n, lead + window, width) and `valid` (n, lead + window): which rows lie in the same episode as row
-            `lead`, the first transition. Rows that are not valid hold other episodes, or nothing.
+            rows (n, lead + window, width) and `valid` (n, lead + window): whether a row is in the same episode as row
+            `lead`, the first transition. Other rows hold other episodes, or nothing.
         """
         chex.assert_type(bits, jnp.uint32)
         oldest = jnp.maximum(self.window - 1, state.written - self.steps + self.mirror + 1)
         environment = (bits[:, 0] % jnp.uint32(self.environments)).astype(jnp.int32)
-        # Number of a window's last row. The remainder favours early rows by at most their number over 2^32.
+        # Index of a window's last row. The remainder favours early rows, by at most (number of rows) / 2^32.
         last = oldest + (bits[:, 1] % (state.written - oldest).astype(jnp.uint32)).astype(jnp.int32)
         size = (1, self.mirror + 1, len(self.fields))
         rows = jax.vmap(lambda e, i: jax.lax.dynamic_slice(state.rows, (e, i, jnp.zeros_like(i)), size)[0])(
             environment, last % self.steps
         )
-        rows = rows.astype(float)  # the float of the learner
+        rows = rows.astype(float)  # the learner's float
         age = rows[:, :, self.fields.index("age")]
         offset = jnp.arange(self.mirror + 1, dtype=age.dtype) - self.lead
         return rows, age - age[:, self.lead, None] == offset[None, :]

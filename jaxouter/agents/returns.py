@@ -10,9 +10,9 @@ import jax.numpy as jnp
 def n_step_return(
     reward: jax.Array, terminated: jax.Array, truncated: jax.Array, discount: float
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return of up to n consecutive steps (n,), ended by the first termination or truncation.
+    """Return of up to n consecutive steps (n,), cut at the first termination or truncation.
 
-    A truncated step is bootstrapped from its final observation, a terminated one (also if truncated too) is not.
+    A truncated step is bootstrapped from its final observation. A terminated one is not, even if also truncated.
 
     Returns:
         The discounted sum of rewards, the discount of the bootstrapped value (0 where terminated), and the index of
@@ -36,13 +36,13 @@ def generalised_advantage(
     discount: float,
     gae_lambda: float,
 ) -> jax.Array:
-    """Generalised advantages (T,): A_k = delta_k + discount lambda A_(k+1), which no episode's end crosses.
+    """Generalised advantages (T,): A_k = delta_k + discount lambda A_(k+1); the sum stops where an episode ends.
 
     Args:
         reward: (T,).
         value, next_value: (T,), of the observation before each step, and of the one after it, before any reset.
         terminated, done: (T,), bool; a truncated step is bootstrapped, a terminated one is not.
-        discount, gae_lambda: a control step.
+        discount, gae_lambda: per control step.
 
     Source: Schulman et al., High-dimensional continuous control using generalised advantage estimation, 2016, eq. 16.
     """

@@ -1,4 +1,4 @@
-"""The controller as C99: NAME.c with the weights, NAME.h beside it. It allocates no memory and has no global state."""
+"""The controller as C99: NAME.c with the weights, and NAME.h. It allocates no memory and has no global state."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ FLAGS = ("-std=c99", "-O2", "-shared", "-fPIC")
 
 
 def prefix(spec: ControllerSpec) -> str:
-    """What every symbol begins with: an identifier of C from the name of the plant."""
+    """Prefix of all symbols: a C identifier made from the plant's name."""
     name = re.sub(r"\W+", "_", spec.plant, flags=re.ASCII).strip("_")
     return f"{'plant_' if name[:1].isdigit() else ''}{name}_outer_loop".lstrip("_")
 
 
 def header_and_source(spec: ControllerSpec, stem: str) -> tuple[str, str]:
-    """Text of the .h and of the .c file that are called `stem`."""
+    """Texts of the files `stem`.h and `stem`.c."""
     widths = [3 + 2 * spec.history, *(len(bias) for bias in spec.biases)]
     values = dict(spec=spec, name=prefix(spec), stem=stem, widths=widths)
     return render("controller.h.j2", **values), render("controller.c.j2", **values)
 
 
 def save(spec: ControllerSpec, path: Path) -> None:
-    """Write the .c file, and the .h file beside it."""
+    """Write the .c file, and the .h file next to it."""
     header, source = header_and_source(spec, path.stem)
     path.write_text(source, encoding="utf-8")
     path.with_suffix(".h").write_text(header, encoding="utf-8")
@@ -58,7 +58,7 @@ def shared_library(sources: Sequence[Path], out: Path, *flags: str) -> None:
 
     Raises:
         FileNotFoundError: there is no compiler.
-        RuntimeError: it fails; with what it says.
+        RuntimeError: the compiler fails; with its output.
     """
     command = [compiler(), *FLAGS, *flags, *map(str, sources), "-o", str(out), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -67,7 +67,7 @@ def shared_library(sources: Sequence[Path], out: Path, *flags: str) -> None:
 
 
 def render(template: str, **values: Any) -> str:
-    """A template of this folder with its values; XML is escaped."""
+    """Fill in a template of this folder; XML is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxouter.exports", "."),
         autoescape=lambda name: name is not None and name.endswith(".xml.j2"),
@@ -82,22 +82,22 @@ def render(template: str, **values: Any) -> str:
 
 
 def _comment(text: str) -> str:
-    """A text that ends no comment, and begins none."""
+    """The text without anything that begins or ends a comment."""
     return re.sub(r"[\x00-\x1f\\]", " ", text).replace("*/", "* /").replace("/*", "/ *")
 
 
 def _float(value: float) -> str:
-    """A constant of C that is the same float32."""
+    """The value as a float32 constant in C."""
     return f"{np.float32(value)!s}f"
 
 
 def _macro(value: float) -> str:
-    """The same, as it may stand in a macro."""
+    """The same, safe for a macro."""
     return f"({_float(value)})" if value < 0 else _float(value)
 
 
 def _floats(array: np.ndarray) -> str:
-    """The elements of an initialiser, row after row."""
+    """The elements of an initialiser, row by row."""
     return textwrap.fill(", ".join(map(_float, array.ravel())), 120, initial_indent="    ", subsequent_indent="    ")
 
 

@@ -1,4 +1,4 @@
-"""The controller as an FMU: FMI 2.0 co-simulation, which runs the C of `exports.c` and no Python."""
+"""The controller as an FMU for FMI 2.0 co-simulation; it runs the C code of `exports.c`, no Python."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxouter.exports import c
 from jaxouter.exports.spec import ControllerSpec
 
 SECONDS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-BASE_UNITS = {  # attributes of FMI's BaseUnit, for units that importers then convert
+BASE_UNITS = {  # attributes of FMI's BaseUnit, so that importers can convert these units
     "s": {"s": 1},
     "rad": {"rad": 1},
     "crad": {"rad": 1, "factor": 0.01},
@@ -21,19 +21,19 @@ BASE_UNITS = {  # attributes of FMI's BaseUnit, for units that importers then co
     "degC": {"K": 1, "offset": 273.15},
 }
 PLATFORMS = {"Linux": ("linux64", ".so"), "Windows": ("win64", ".dll"), "Darwin": ("darwin64", ".dylib")}
-BEGINNING = (1980, 1, 1, 0, 0, 0)  # of the time that zip knows: the same controller gives the same file
+BEGINNING = (1980, 1, 1, 0, 0, 0)  # earliest time in a zip file; fixed, so that equal controllers give equal files
 
 
 def control_step(spec: ControllerSpec) -> float:
-    """In seconds, as FMI has time; as it is where the unit of time is not known."""
+    """The control step in seconds, FMI's unit of time; unconverted if the unit is unknown."""
     return spec.control_step * SECONDS.get(spec.time_unit, 1.0)
 
 
 def platform_folder() -> tuple[str, str]:
-    """Where FMI looks for the library of this system, and how its name ends.
+    """FMI's folder for libraries of this system, and their file suffix.
 
     Raises:
-        FileNotFoundError: FMI 2.0 knows no such system.
+        FileNotFoundError: FMI 2.0 does not support this system.
     """
     system = platform.system()
     if system not in PLATFORMS:
@@ -42,14 +42,14 @@ def platform_folder() -> tuple[str, str]:
 
 
 def texts(spec: ControllerSpec) -> dict[str, str]:
-    """What an importer reads or compiles, by its path in the FMU."""
+    """The text files of the FMU, by their path in it."""
     name = c.prefix(spec)
     header, source = c.header_and_source(spec, name)
     time_unit = "s" if spec.time_unit in SECONDS else spec.time_unit
     values = dict(
         spec=spec,
         name=name,
-        guid=f"{{{uuid.uuid5(uuid.NAMESPACE_URL, source)}}}",  # another controller has another one
+        guid=f"{{{uuid.uuid5(uuid.NAMESPACE_URL, source)}}}",  # differs from controller to controller
         step=control_step(spec),
         time_unit=time_unit,
         units={unit: BASE_UNITS.get(unit) for unit in dict.fromkeys((spec.y_unit, time_unit))},
@@ -65,7 +65,7 @@ def texts(spec: ControllerSpec) -> dict[str, str]:
 
 
 def save(spec: ControllerSpec, path: Path) -> None:
-    """Write the FMU, with a library for the system that this is.
+    """Write the FMU, with a library for this system.
 
     Raises:
         FileNotFoundError: there is no C compiler.
@@ -79,7 +79,7 @@ def save(spec: ControllerSpec, path: Path) -> None:
             (root / each).write_text(text, encoding="utf-8")
         library = root / f"{name}{suffix}"
         sources = sorted((root / "sources").glob("*.c"))
-        c.shared_library(sources, library, "-fvisibility=hidden")  # else two FMUs in a process could meet
+        c.shared_library(sources, library, "-fvisibility=hidden")  # symbols of two FMUs in one process must not clash
         contents = {each: text.encode() for each, text in files.items()}
         contents[f"binaries/{folder}/{name}{suffix}"] = library.read_bytes()
     with zipfile.ZipFile(path, "w") as file:

@@ -3,8 +3,8 @@
     inputs   r (), y (), y_past (H,), r_tilde_past (H,), integral ()
     outputs  r_tilde (), y_past_next (H,), r_tilde_past_next (H,), integral_next ()
 
-All are float32. The graph has no memory: what comes out as `..._next` goes in at the next control step. How to begin,
-units and bounds stand in the metadata of the model.
+All are float32. The graph has no memory: feed each output `..._next` back in at the next control step. The model's
+metadata give the initial values, units and bounds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ try:
 except ImportError as error:
     raise ImportError('jaxouter.exports.onnx needs ONNX: pip install "jaxouter[onnx]"') from error
 
-OPSET, IR_VERSION = 17, 8  # of 2022, which runtimes of controllers read too
+OPSET, IR_VERSION = 17, 8  # of 2022, so that the runtimes of embedded controllers can read them too
 START = (
     "Before the first step: y_past is filled with the first y, r_tilde_past with that y clipped to "
     "[r_tilde_min, r_tilde_max], integral is 0."
@@ -30,7 +30,7 @@ START = (
 
 
 class _Graph:
-    """Nodes and constants as they are added."""
+    """Collects nodes and constants."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -88,7 +88,7 @@ def model(spec: ControllerSpec) -> onnx.ModelProto:
 
 
 def metadata(spec: ControllerSpec) -> dict[str, str]:
-    """What a caller has to know, as the texts that ONNX keeps."""
+    """What a caller needs to know, as strings for the model's metadata."""
     (low, high), (r_min, r_max), (y_min, y_max) = spec.r_tilde_bounds, spec.setpoint_range, spec.y_range
     numbers = {"control_step": spec.control_step, "r_tilde_min": low, "r_tilde_max": high}
     numbers |= {"r_min": r_min, "r_max": r_max, "y_min": y_min, "y_max": y_max, "history": spec.history}
@@ -106,7 +106,7 @@ def _value(name: str, shape: list[int], text: str) -> onnx.ValueInfoProto:
 
 
 def _observation(graph: _Graph, spec: ControllerSpec) -> str:
-    """Of `jaxouter.loop.observation.Observer`, (3 + 2H,); it leaves `error` and `integral_next` too."""
+    """The observation of `jaxouter.loop.observation.Observer`, (3 + 2H,); also adds `error` and `integral_next`."""
     low, high = spec.r_tilde_bounds
     error = graph.add("Sub", "error", "r", "y")
     change = graph.add("Sub", "error_minus_integral", error, "integral")
@@ -133,7 +133,7 @@ def _network(graph: _Graph, spec: ControllerSpec, x: str) -> str:
 
 
 def _remember(graph: _Graph) -> None:
-    """The newest sample in front, the oldest one out."""
+    """Shift the histories: newest sample in front, oldest one dropped."""
     begin, end = graph.constant("begin", [0], np.int64), graph.constant("all_but_last", [-1], np.int64)
     for name, newest in (("y_past", "y"), ("r_tilde_past", "r_tilde")):
         kept = graph.add("Slice", f"{name}_kept", name, begin, end)

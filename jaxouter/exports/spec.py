@@ -1,4 +1,4 @@
-"""The learned controller as numbers: what every export holds, and the control spec in NumPy. Imports no JAX."""
+"""The learned controller as plain numbers, common to all exports, and its evaluation in NumPy. Imports no JAX."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORMAT = 1
 
 
 class State(NamedTuple):
-    """What the controller remembers between two control steps; float32."""
+    """State of the controller between two control steps; float32."""
 
     y_past: np.ndarray  # (H,), y_(k-1), y_(k-2), ...
     r_tilde_past: np.ndarray  # (H,), r~_(k-1), r~_(k-2), ...
@@ -32,7 +32,7 @@ class ControllerSpec:
     """r~ = clip(offset + slope r + half the range of r~ times tanh(network(observation))).
 
     The observation, (3 + 2H,), is that of `jaxouter.loop.observation.Observer`: [r - y_middle, r - y, integral,
-    past y - y] / y_scale, and past r~ in terms of its range.
+    past y - y] / y_scale, and past r~ scaled to [-1, 1].
     """
 
     plant: str
@@ -42,9 +42,9 @@ class ControllerSpec:
     """In `time_unit`."""
     r_tilde_bounds: tuple[float, float]
     setpoint_range: tuple[float, float]
-    """Set-points that training had."""
+    """Set-points in training."""
     y_range: tuple[float, float]
-    """Where y was in training: it ended episodes that left this."""
+    """Range of y in training; episodes that left it were ended."""
     history: int
     """H, past samples of y and of r~."""
     integral_steps: float
@@ -59,7 +59,7 @@ class ControllerSpec:
     """Of each layer, (m,), float32."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError where the layers don't fit together."""
+        """Raises ValueError if the layers don't fit together."""
         widths = [3 + 2 * self.history, *(len(bias) for bias in self.biases)]
         wanted = list(pairwise(widths))
         shapes = [weight.shape for weight in self.weights]
@@ -91,7 +91,7 @@ class ControllerSpec:
         )
 
     def init(self, y0: float, r_tilde: float | None = None) -> State:
-        """Before the first step: histories filled with y_0, and with r~ clipped to its bounds; None: r~ = y_0."""
+        """State before the first step: histories filled with y_0 and with r~ (None: y_0) clipped to its bounds."""
         before = self._clip(y0 if r_tilde is None else r_tilde)
         y_past, r_tilde_past = (np.full(self.history, value, np.float32) for value in (y0, before))
         return State(y_past, r_tilde_past, np.float32(0.0))
@@ -109,13 +109,13 @@ class ControllerSpec:
         return State(state.y_past, state.r_tilde_past, integral)
 
     def r_tilde(self, state: State, r: float, y: float) -> np.float32:
-        """r~_k, of a state in which r_k - y_k is integrated."""
+        """r~_k, from a state in which r_k - y_k is already integrated."""
         low, high = self.r_tilde_bounds
         action = self._action(self._observation(state, np.float32(r), np.float32(y)))
         return np.float32(self._clip(self.offset + self.slope * r + (high - low) / 2 * action))
 
     def record(self, state: State, y: float, r_tilde: float | np.float32) -> State:
-        """After r~_k is chosen: y_k and r~_k become past."""
+        """After r~_k is chosen: y_k and r~_k enter the past."""
         return State(_pushed(state.y_past, y), _pushed(state.r_tilde_past, r_tilde), state.integral)
 
     def _observation(self, state: State, r: np.float32, y: np.float32) -> np.ndarray:
@@ -131,7 +131,7 @@ class ControllerSpec:
 
     def _action(self, x: np.ndarray) -> float:
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = x.dot(weight)  # less overhead than @, which at these sizes is what counts
+            x = x.dot(weight)  # less overhead than @, which matters at these sizes
             x += bias
             np.maximum(x, 0.0, out=x)
         return math.tanh(x.dot(self.weights[-1])[0] + self.biases[-1][0])
@@ -141,7 +141,7 @@ class ControllerSpec:
         return min(max(r_tilde, low), high)
 
     def save(self, path: Path) -> None:
-        """Write an npz file: `header`, JSON of everything but the layers, and `weight_i`, `bias_i` of each layer."""
+        """Write an npz file: `header`, JSON of all but the layers, and `weight_i` and `bias_i` of each layer."""
         header = {name: value for name, value in asdict(self).items() if name not in ("weights", "biases")}
         arrays = {f"weight_{i}": weight for i, weight in enumerate(self.weights)}
         arrays |= {f"bias_{i}": bias for i, bias in enumerate(self.biases)}
@@ -150,10 +150,10 @@ class ControllerSpec:
 
     @classmethod
     def load(cls, path: Path) -> ControllerSpec:
-        """The spec in a file that `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
-            ValueError: it is no such file, or is damaged.
+            ValueError: it is not such a file, or is damaged.
         """
         try:
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -166,7 +166,7 @@ class ControllerSpec:
             raise ValueError(f"{path} is not of format {FORMAT}, the one that this version reads")
         names = {f.name for f in fields(cls)} - {"weights", "biases"}
         if set(header) != names:
-            raise ValueError(f"{path} is damaged: its header has fields {sorted(set(header) ^ names)} missing or more")
+            raise ValueError(f"{path} is damaged: its header has missing or extra fields {sorted(set(header) ^ names)}")
         header = {name: tuple(value) if isinstance(value, list) else value for name, value in header.items()}
         return cls(**header, weights=weights, biases=biases)
 

@@ -27,7 +27,7 @@ PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 
 def exported(policy: LearnedPolicy, params: LearnedParams) -> export.Exported:
-    """`policy.act` with its numbers inside, for each of `PLATFORMS`."""
+    """`policy.act` with its parameters as constants, for each of `PLATFORMS`."""
     numbers = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), params)
 
     def outer_loop(
@@ -38,10 +38,10 @@ def exported(policy: LearnedPolicy, params: LearnedParams) -> export.Exported:
 
     number = jax.ShapeDtypeStruct((), np.float32)
     past = jax.ShapeDtypeStruct((policy.observer.history,), np.float32)
-    with jax.default_matmul_precision("highest"):  # else GPUs and TPUs round what they multiply
+    with jax.default_matmul_precision("highest"):  # else GPUs and TPUs round the inputs of matrix products
         return export.export(jax.jit(outer_loop), platforms=PLATFORMS)(number, number, past, past, number)
 
 
 def save(policy: LearnedPolicy, params: LearnedParams, path: Path) -> None:
-    """Write what `jax.export.deserialize` reads."""
+    """Write a file for `jax.export.deserialize`."""
     path.write_bytes(exported(policy, params).serialize())

@@ -1,4 +1,4 @@
-"""Whether an exported controller does what the policy does: runs the file that was written, beside the policy."""
+"""Verify an exported controller: run the written file next to the policy, and compare their r~."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from jaxouter.exports.spec import ControllerSpec, State
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 STEPS = 1_000
-AT_A_STEP = 1e-5  # what may lie between both, in terms of the range of r~, when both are in the policy's state
-IN_CLOSED_LOOP = 1e-4  # when each is in a state of its own
+AT_A_STEP = 1e-5  # tolerance as share of the range of r~, if both start each step in the policy's state
+IN_CLOSED_LOOP = 1e-4  # likewise, if each carries its own state
 HELD = 20  # control steps for which a set-point is held
 
 
 class Controller(Protocol):
-    """A file that was opened. It takes states of its own and those of `ControllerSpec`."""
+    """An opened file. It takes its own states and those of `ControllerSpec`."""
 
     def init(self, y0: float) -> Any:
         """State before the first step."""
@@ -38,7 +38,7 @@ class Controller(Protocol):
 
 
 class Signals(NamedTuple):
-    """What the policy saw and did; the leading axis is that of T steps."""
+    """Inputs, states and outputs of the policy; the leading axis is T steps."""
 
     r: np.ndarray
     y: np.ndarray
@@ -47,30 +47,30 @@ class Signals(NamedTuple):
 
 
 class Deviation(NamedTuple):
-    """The largest one over all steps, in terms of the range of r~."""
+    """The largest deviation over all steps, as share of the range of r~."""
 
     at_a_step: float
     in_closed_loop: float
 
     @property
     def small(self) -> bool:
-        """Whether it is within both tolerances; what is not a number is not."""
+        """Whether both are within tolerance; NaN is not."""
         return self.at_a_step <= AT_A_STEP and self.in_closed_loop <= IN_CLOSED_LOOP
 
 
 def verify(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> Deviation:
-    """How far the r~ of an exported file are from the policy's.
+    """Deviation of an exported file's r~ from the policy's.
 
     Raises:
-        ImportError: what runs this kind of file is not installed.
-        FileNotFoundError: there is no C compiler, which C needs to run.
+        ImportError: the package that runs this kind of file is not installed.
+        FileNotFoundError: the export is C, and there is no C compiler to run it.
     """
     with opened(kind, path, spec) as controller:
         return deviation(controller, spec, signals(spec, policy, params))
 
 
 def signals(spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams, steps: int = STEPS) -> Signals:
-    """The policy on random set-points, and a y that follows them with a lag and noise."""
+    """Run the policy on random set-points and on a y that follows them with a lag and noise."""
     rng = np.random.default_rng(0)
     low, high = spec.setpoint_range
     r = np.repeat(rng.uniform(low, high, -(-steps // HELD)), HELD)[:steps]
@@ -93,7 +93,7 @@ def _record(policy: LearnedPolicy, params: LearnedParams, r: jax.Array, y: jax.A
 
 
 def deviation(controller: Controller, spec: ControllerSpec, seen: Signals) -> Deviation:
-    """Of a controller from what the policy did, step by step in its state, and in a state of the controller's own."""
+    """Deviation of a controller from the policy: in the policy's state at each step, and with its own state."""
     state, got = controller.init(seen.y[0]), []
     for k, (r, y) in enumerate(zip(seen.r, seen.y, strict=True)):
         _, at_a_step = controller.act(jax.tree.map(lambda leaf, k=k: leaf[k], seen.state), r, y)
@@ -109,8 +109,8 @@ def opened(kind: str, path: Path, spec: ControllerSpec) -> Iterator[Controller]:
     """The controller in a file of this kind.
 
     Raises:
-        ImportError: what runs it is not installed.
-        FileNotFoundError: there is no C compiler, which C needs to run.
+        ImportError: the package that runs it is not installed.
+        FileNotFoundError: the export is C, and there is no C compiler to run it.
     """
     with tempfile.TemporaryDirectory() as place:
         match kind:
@@ -181,7 +181,7 @@ def _fill(struct: Any, state: State) -> None:
 
 
 class CController:
-    """A library of the C code, called as C calls it."""
+    """The C code as a library, called through its C interface."""
 
     def __init__(self, library: Path, spec: ControllerSpec) -> None:
         loaded, name = ctypes.CDLL(str(library)), c.prefix(spec)
@@ -198,7 +198,7 @@ class CController:
         return struct
 
     def act(self, state: Any, r: float, y: float) -> tuple[Any, float]:
-        """One control step; the state that is given stays as it is."""
+        """One control step; the given state is not changed."""
         struct = self._struct()
         if isinstance(state, State):
             _fill(struct, state)
@@ -208,7 +208,7 @@ class CController:
 
 
 class FmuController:
-    """An FMU run by FMPy, as an importer steps it; states travel as serialised states of the FMU."""
+    """An FMU run by FMPy, stepped like by an importer; states are the FMU's serialised states."""
 
     def __init__(self, path: Path, place: Path, spec: ControllerSpec) -> None:
         try:
@@ -242,7 +242,7 @@ class FmuController:
         self._fmu.freeInstance()
 
     def init(self, y0: float) -> bytes:
-        """State before the first step, which takes y0 from its y."""
+        """State before the first step; y0 comes with that step's y."""
         del y0
         self._fmu.reset()
         self._fmu.setupExperiment()

@@ -1,4 +1,4 @@
-"""Identification: models of a plant from records of r~ and y, and how far they hold."""
+"""Identification: models of a plant from records of r~ and y, and their validation."""
 
 from jaxouter.identification import recorded_data
 from jaxouter.plants import registry

@@ -1,4 +1,4 @@
-"""Columns of numbers from CSV and Parquet files; what is wrong with a file, and what to write instead."""
+"""Read columns of numbers from CSV and Parquet files; errors say what is wrong and what to write instead."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
-CONTENTS = {  # by which a file begins that only its name makes a CSV
+CONTENTS = {  # first bytes of files that are no CSV in spite of their name
     b"PK\x03\x04": "a workbook (.xlsx, .ods) or another zip file; export it as CSV",
     b"\xd0\xcf\x11\xe0": "an old workbook (.xls); export it as CSV",
     b"\x1f\x8b": "compressed; unpack it first",
     b"PAR1": "Parquet; name it .parquet",
 }
 SEPARATORS = {";": ("';'", "';'"), "\t": ("tabs", r"'\t'"), "|": ("'|'", "'|'"), None: ("spaces", r"r'\s+'")}
-MEANT = {  # what loggers write: letters and digits only, in lower case
+MEANT = {  # column names that data loggers write; in lower case, letters and digits only
     "time": ("t", "times", "timestamp", "datetime", "date", "seconds", "sec", "elapsedtime", "zeit", "temps", "tiempo"),
     "r_tilde": ("r~", "r̃", "rt", "r", "setpoint", "sp", "reference", "ref", "command", "input", "u", "sollwert"),
     "y": ("output", "out", "pv", "processvalue", "measurement", "measured", "istwert"),
     "r": ("reference", "ref", "setpoint", "sp", "sollwert"),
 }
-PREAMBLE = 50  # lines among which a header is looked for
+PREAMBLE = 50  # lines in which the header is searched
 MISSING = ("", "-", "?", "na", "n/a", "#n/a", "null", "none", "missing")
 NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([T\s]|$)|\d{1,2}:\d{2}", re.IGNORECASE)
@@ -34,7 +34,7 @@ THOUSANDS = re.compile(r"[+-]?\d{1,3}((?P<mark>[,.' _\u00a0\u202f’])\d{3})((?P
 
 
 def read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
-    """The columns with these names, (N,) each; others are left alone.
+    """The columns with these names, (N,) each; others are ignored.
 
     Args:
         path: a CSV or, by its suffix, a Parquet file.
@@ -74,7 +74,7 @@ def _csv(content: bytes, names: Sequence[str]) -> list[list[str]]:
 
 
 def _text(content: bytes, names: Sequence[str]) -> str:
-    """Raises ValueError where it is empty or no UTF-8."""
+    """Raises ValueError if it is empty or not UTF-8."""
     for begin, what in CONTENTS.items():
         if content.startswith(begin):
             raise ValueError(f"it is no CSV but {what}")
@@ -91,7 +91,7 @@ def _text(content: bytes, names: Sequence[str]) -> str:
 
 
 def _look_for_header(header: list[str], lines: list[str], names: Sequence[str]) -> None:
-    """Raises ValueError where lines before the header, another separator or numbers are why it isn't there."""
+    """Raises ValueError if the header is hidden: lines before it, another separator, or numbers in its place."""
     for number, line in enumerate(lines[1:], 2):
         cells = [cell.strip(" '\"") for cell in re.split(r"[,;\t|]", line)]
         if all(any(_means(cell, name) for cell in cells) for name in names):
@@ -112,10 +112,10 @@ def _look_for_header(header: list[str], lines: list[str], names: Sequence[str]) 
 
 
 def _places(header: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Where the columns are.
+    """Indices of the columns.
 
     Raises:
-        ValueError: one isn't there, or is twice.
+        ValueError: a column is missing or there twice.
     """
     found = []
     for name in names:
@@ -134,7 +134,7 @@ def _places(header: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def _means(cell: str, name: str) -> bool:
-    """Whether the name of a column is this one but for its case, unit, language or the like."""
+    """Whether a column's name is a variant of `name`: another case, unit, language or the like."""
     plain = re.sub(r"[\[({<].*|[/,].*", "", cell.strip().strip("#%/;!'\" ").lower())
     plain = re.sub(r"[\s_.-]", "", plain)
     if name == "time":
@@ -143,13 +143,13 @@ def _means(cell: str, name: str) -> bool:
 
 
 def _length(number: int, row: Sequence[str], header: Sequence[str]) -> str:
-    """What is wrong with a row that has fewer or more values than there are names."""
-    told = f"row {number} has {len(row)} values, the header {len(header)} names"
+    """What is wrong with a row whose number of values differs from the header's."""
+    counts = f"row {number} has {len(row)} values, the header {len(header)} names"
     if len(row) < len(header):
-        return f"{told}; complete the row or remove it"
+        return f"{counts}; complete the row or remove it"
     if all(re.fullmatch(r"[+-]?\d+", cell.strip()) for cell in row):
-        return f"{told}: decimals are commas; write '.' in numbers, as in 0.5"
-    return f"{told}; name every column, and write '.', not ',', in numbers"
+        return f"{counts}: decimals are commas; write '.' in numbers, as in 0.5"
+    return f"{counts}; name every column, and write '.', not ',', in numbers"
 
 
 def _parquet(content: bytes, names: Sequence[str]) -> list[list[Any]]:
@@ -189,7 +189,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _cure(name: str, value: Any) -> str:
-    """What to write instead of a value that is no number."""
+    """What to write instead of a value that is not a number."""
     text = "" if value is None else str(value).strip()
     if text.lower() in MISSING:
         return "it is missing: fill it in, or cut the record there"

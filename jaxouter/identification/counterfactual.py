@@ -1,8 +1,8 @@
-"""A plant as its own records tell it: what a recorded episode would have been under another r~.
+"""A plant built from recorded episodes: it predicts what each would have been under another r~.
 
-Of a linear plant the answer needs only its response to a change of r~: the recorded y, plus the response to the
-difference between the other r~ and the recorded one. Start, load and noise of the episode, known to nobody, are in the
-recorded y. So a record of (r~, y) and a fitted response make a plant that can be asked any number of times.
+For a linear plant that is the recorded y plus the response to the difference between the new r~ and the recorded one.
+The unknown start, load and noise of the episode are already in the recorded y. So a record of (r~, y) and a fitted
+response make a plant on which any number of new episodes can be simulated.
 """
 
 from __future__ import annotations
@@ -23,19 +23,17 @@ from jaxouter.plants.base import float_leaves, with_float_leaves
 
 
 class CounterfactualParams(NamedTuple):
-    """Recorded episodes (E, ...), and the response of each; an episode that is drawn, without E."""
+    """Recorded episodes (E, ...), and the response of each; without the axis E, one drawn episode."""
 
-    a: jax.Array  # (E, n), dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i), with the differences to what was recorded
+    a: jax.Array  # (E, n), dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i) for the differences to the record
     b: jax.Array  # (E, n)
     r_tilde: jax.Array  # (E, T), recorded
     y: jax.Array  # (E, T + 1), recorded
-    smoothed: (
-        jax.Array
-    )  # (E, T + 1), y as it would have been with what disturbed it smoothed over a quarter of an episode
+    smoothed: jax.Array  # (E, T + 1), y with its disturbance smoothed over a quarter of an episode
 
 
 class CounterfactualState(NamedTuple):
-    """Differences to the recorded episode, the newest first."""
+    """Differences to the recorded episode, newest first."""
 
     dy: jax.Array  # (n,)
     dr_tilde: jax.Array  # (n,)
@@ -43,11 +41,11 @@ class CounterfactualState(NamedTuple):
 
 
 def fit(data: Record, lags: int) -> CounterfactualParams:
-    """The response by least squares over all episodes, each with a level of its own.
+    """Fit the response by least squares over all episodes; each episode has its own offset.
 
     Args:
         data: exciting episodes of one plant.
-        lags: n, past samples of y and of r~ on which the next y depends; at most half an episode.
+        lags: n, number of past samples of y and of r~ on which the next y depends; at most half an episode.
     """
     k = np.arange(lags - 1, data.r_tilde.shape[1])
     past = k[:, None] - np.arange(lags)
@@ -62,32 +60,32 @@ def fit(data: Record, lags: int) -> CounterfactualParams:
 
 
 def _smoothed(y: np.ndarray, disturbance: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """`y` (E, T + 1) less what the quick part of the disturbances (E, T - n + 1) of its last samples did to it."""
+    """`y` (E, T + 1) without the effect of the fast part of the disturbance (E, T - n + 1) on its last samples."""
     window = min(disturbance.shape[1], y.shape[1] // 4) // 2 * 2 + 1
-    quick = disturbance - savgol_filter(disturbance, window, min(2, window - 1))
-    did = np.asarray(lfilter([1.0], np.append(1.0, -a), quick))
-    return np.concatenate([y[:, : -did.shape[1]], y[:, -did.shape[1] :] - did], 1)
+    fast = disturbance - savgol_filter(disturbance, window, min(2, window - 1))
+    effect = np.asarray(lfilter([1.0], np.append(1.0, -a), fast))
+    return np.concatenate([y[:, : -effect.shape[1]], y[:, -effect.shape[1] :] - effect], 1)
 
 
 def simulated(original: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> CounterfactualParams:
-    """Episodes of a known plant and its response, found by moving r~ for one step; its own `draw` for each.
+    """Episodes of a plant that can be simulated, and its impulse response; each episode has its own `draw`.
 
-    Exact, and for a plant with inner steps and delay lines many times faster than stepping it, but only where its
-    response is the same at all times.
+    Exact if the plant is linear and time-invariant. For a plant with inner steps and delay lines it is many times
+    faster than stepping.
 
     Raises:
-        ValueError: the response half an episode later is another.
+        ValueError: the response half an episode later is different.
     """
     *found, early, late = map(np.asarray, _moved(original, params, jax.random.split(key, episodes)))
     off = np.abs(early[:, : late.shape[1]] - late).max(1)
     if np.any(off > 1e-3 * np.abs(early).max(1)):
-        raise ValueError(f"plant {original.name!r} responds otherwise half an episode later")
+        raise ValueError(f"plant {original.name!r} responds differently half an episode later")
     return CounterfactualParams(*(jnp.asarray(x, float) for x in (np.zeros_like(early), early, *found)))
 
 
 @partial(jax.jit, static_argnums=0)
 def _moved(original: Plant, params: Any, keys: chex.PRNGKey) -> Any:
-    """r~ and y, y without noise, and the responses to a move of r~ at the start and in the middle; each (E, ...)."""
+    """r~, y, y without noise, and the responses to an impulse of r~ at the start and half way; each (E, ...)."""
     steps, (low, high) = original.episode_steps, original.r_tilde_bounds
 
     def episode(key: chex.PRNGKey) -> Any:
@@ -110,9 +108,9 @@ def _moved(original: Plant, params: Any, keys: chex.PRNGKey) -> Any:
 
 @cache
 def plant(original: Plant, lags: int) -> Plant:
-    """The plant with the declaration of `original` whose parameters are `CounterfactualParams`; the same each time.
+    """The plant declared like `original` whose parameters are `CounterfactualParams`; cached, as it is a jit key.
 
-    Each training episode is another view of one of the recorded ones. No longer than they are.
+    Each training episode replays a recorded one under another r~, and is no longer than it.
     """
 
     def init(key: chex.PRNGKey, params: CounterfactualParams) -> CounterfactualState:

@@ -1,4 +1,4 @@
-"""What a record tells of a plant: order, dead time, whether it comes to rest, and the history that it needs."""
+"""Dynamics of a plant from a record: order, dead time, whether it is stable, and the history an agent needs."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from jaxouter.loop.observation import HISTORY
 from jaxouter.plants import Plant
 
 EXPLORED = 8  # episodes from which order and dead time are identified
-DRAWN = 4  # plants of which these are, each, where a plant is drawn for each episode
-SHOWN = 0.99  # of the prediction error without r~: with r~ it must be smaller, or y does not show it
-NEGLIGIBLE = 0.01  # of the largest coefficient of r~; the first ones below are dead time
-ENOUGH = 20  # past samples in an observation, of a high order
-BEYOND = 8  # of them beyond a long dead time
+DRAWN = 4  # plants to identify if each episode draws another plant
+SHOWN = 0.99  # y shows r~ if r~ reduces the prediction error below this share
+NEGLIGIBLE = 0.01  # of the largest coefficient of r~; leading ones below are dead time
+ENOUGH = 20  # cap on the past samples in an observation for a high order ...
+BEYOND = 8  # ... but after a long dead time up to this many more
 
 
 class Dynamics(NamedTuple):
-    """How y answers to r~, as a record tells; times in control steps."""
+    """How y responds to r~ according to a record; times in control steps."""
 
     order: int
-    dead: int  # dead time beyond the one of sampling
+    dead: int  # dead time in addition to the one step of sampling
     settling: float  # until a step response stays within 5 % of its end; inf: it never does
     kind: Literal["stable", "integrating", "unstable"]
     shown: bool  # whether y shows r~ at all
@@ -54,7 +54,7 @@ def of_record(data: Record) -> Dynamics:
 
 
 def explore(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[list[Dynamics], int]:
-    """Dynamics of a plant, or of some that are drawn where each episode draws one, and the control steps recorded."""
+    """Dynamics of the plant (of `DRAWN` plants if episodes draw them), and the control steps that were recorded."""
     found = []
     for one in jax.random.split(key, 1 if plant.draw is None else DRAWN):
         drawn = params if plant.draw is None else plant.draw(jax.random.fold_in(one, 1), params)
@@ -63,12 +63,12 @@ def explore(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[list[Dynamics
 
 
 def history_for(order: int, dead: int, least: int) -> int:
-    """Past samples that an observation must hold to tell what r~ is under way, and the state of such a plant."""
+    """Past samples an observation must hold to show the r~ still in the dead time, and the state of the plant."""
     return max(least, dead + min(order + 1, max(ENOUGH - dead, BEYOND)))
 
 
 def suitable_history(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[int, int]:
-    """Past samples that an observation of a plant holds, as it declares or told by a record; and steps recorded."""
+    """Past samples in the observation, as declared by the plant or identified; and the control steps recorded."""
     if plant.history is not None:
         return plant.history, 0
     found, steps = explore(plant, params, key)

@@ -1,4 +1,4 @@
-"""Linear models of y by past y and r~ (ARX): least squares, prediction, choice of order and dead time."""
+"""Linear models of y from past y and r~ (ARX): least squares, prediction, choice of order and dead time."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from jaxouter.plants.arx import Model
 
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16)
 PARSIMONY = 1e-3  # prediction error, as share of the standard deviation of y, that a smaller order may cost
-COARSE = 4  # order and stride with which long dead times are searched at first
-NEAR = 12  # control steps on both sides of the best of these, where the other orders are tried
-FARTHEST = 0.75  # longest dead time that is searched, as share of an episode
-HORIZON = 0.3  # of the predictions by which models are chosen, as share of an episode
-INTEGRATES = 0.05  # distance of a pole from 1, over one divided by the control steps in which nothing shows of it
+COARSE = 4  # order and stride of the first search for long dead times
+NEAR = 12  # control steps on both sides of its best, where the other orders are tried
+FARTHEST = 0.75  # longest dead time searched, as share of an episode
+HORIZON = 0.3  # prediction horizon for choosing models, as share of an episode
+INTEGRATES = 0.05  # a pole closer to 1 than this divided by the episode length can't be told from an integrator
 BAND = 0.05  # of the step, for the settling time
 
 
@@ -27,12 +27,12 @@ class ARX(NamedTuple):
     a: np.ndarray  # (n,)
     b: np.ndarray  # (n,)
     c: float
-    dead: int  # dead time in control steps beyond the one of sampling
+    dead: int  # dead time in control steps, in addition to the one of sampling
     sigma: float  # standard deviation of e
 
 
 def fit_arx(data: Record, n: int, dead: int) -> ARX:
-    """Least squares over all episodes; what is not finite is left out."""
+    """Least squares over all episodes; samples that are not finite are left out."""
     first, steps = n + dead - 1, data.r_tilde.shape[1]
     k = np.arange(first, steps)
     lags = k[:, None] - np.arange(n)
@@ -47,7 +47,7 @@ def fit_arx(data: Record, n: int, dead: int) -> ARX:
 
 
 def predict(model: ARX, data: Record, horizon: int) -> np.ndarray:
-    """Predictions of y up to `horizon` steps ahead, with the r~ that came; (episodes, starts, horizon)."""
+    """Predictions of y up to `horizon` steps ahead, given the recorded r~; (episodes, starts, horizon)."""
     n, dead, steps = len(model.a), model.dead, data.r_tilde.shape[1]
     starts = np.arange(n + dead - 1, steps - horizon + 1, max(1, horizon // 4))
     window = [data.y[:, starts - i] for i in range(n)]
@@ -61,7 +61,7 @@ def predict(model: ARX, data: Record, horizon: int) -> np.ndarray:
 
 
 def prediction_error(model: ARX, data: Record, horizon: int) -> float:
-    """Root mean square error of `predict`, where the truth is finite; inf where the model is of no use."""
+    """Root mean square error of `predict` where the truth is finite; inf if it diverges or nothing is left."""
     n, steps = len(model.a), data.r_tilde.shape[1]
     starts = np.arange(n + model.dead - 1, steps - horizon + 1, max(1, horizon // 4))
     truth = np.stack([data.y[:, starts + j + 1] for j in range(horizon)], -1)
@@ -72,10 +72,10 @@ def prediction_error(model: ARX, data: Record, horizon: int) -> float:
 
 
 def choose_arx(data: Record, horizon: int) -> ARX:
-    """Order and dead time with the least error of prediction over the horizon on the last quarter of the record.
+    """Order and dead time with the least prediction error over the horizon on the last quarter of the record.
 
-    Of the orders that predict about as well the smallest is taken, and fitted again to the whole record. Dead times
-    beyond a twentieth of an episode are tried where a coarse search, with a stride, finds one that predicts as well.
+    The smallest order that predicts about as well is taken, and fitted again to the whole record. Dead times beyond a
+    twentieth of an episode are tried only if a coarse search finds one that predicts as well.
 
     Args:
         data: at least 4 episodes.
@@ -85,7 +85,7 @@ def choose_arx(data: Record, horizon: int) -> ARX:
     fitted, held_out = (Record(data.r_tilde[part], data.y[part]) for part in (slice(kept), slice(kept, None)))
 
     def errors_of(orders: Any, dead_times: range, horizon: int, stride: int = 0) -> dict[tuple[int, int], float]:
-        """By order and dead time, of those for which the record is long enough."""
+        """Errors by (order, dead time), for those that the record is long enough for."""
         return {
             (n, dead): prediction_error(fit_arx(fitted, n, dead), held_out, horizon)
             for n in orders
@@ -110,7 +110,7 @@ def choose_arx(data: Record, horizon: int) -> ARX:
 
 
 def kind_of(model: Model, steps: int) -> Literal["stable", "integrating", "unstable"]:
-    """Whether the model comes to rest, told by its largest pole: by what that makes of so many control steps."""
+    """Kind of the model by its largest pole, as far as it shows within `steps` control steps."""
     poles = np.roots(np.append(1.0, -np.asarray(model.a)))
     largest = complex(poles[np.argmax(np.abs(poles))]) if poles.size else 0.0j
     if abs(largest) > 1.0 + 1.0 / steps:
@@ -134,17 +134,17 @@ def gain(model: Model) -> float:
 
 
 def offset(model: Model) -> float:
-    """Y in steady state under r~ = 0."""
+    """Steady-state y under r~ = 0."""
     return float(model.c / (1.0 - np.sum(model.a)))
 
 
 def step_response(model: Model, steps: int) -> np.ndarray:
-    """Change of x_0 to x_(steps - 1) from a unit step of r~_0 on; (steps,)."""
+    """Change of y_0 to y_(steps - 1) after a unit step of r~ at 0; (steps,)."""
     return np.asarray(lfilter(np.append(0.0, model.b), np.append(1.0, -model.a), np.ones(steps)))
 
 
 def settling(model: Model) -> int:
-    """Control steps until the step response stays within 5 % of its end."""
+    """Control steps until the step response stays within 5 % of its final value."""
     tail = math.log(1e-3) / math.log(max(radius(model), 1e-3))
     off = np.abs(step_response(model, len(model.b) + min(math.ceil(tail), 100_000)) / gain(model) - 1.0)
     return int(np.max(np.flatnonzero(~(off <= BAND)), initial=-1)) + 1

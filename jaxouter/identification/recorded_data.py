@@ -1,4 +1,4 @@
-"""A plant from a record of r~ and y: an ensemble of identified models, whose spread is the domain randomisation."""
+"""A plant from recorded r~ and y: an ensemble of identified models, whose spread is the domain randomisation."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from jaxouter.plants.simulators import PlantOptions
 
 COLUMNS = ("time", "r_tilde", "y")
 LEAST_ROWS = 200
-JITTER = 1e-3  # by which a step may differ from the others, as share of it
+JITTER = 1e-3  # allowed deviation of a time step from the median, as share of it
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-EACH = 8  # rows that a coefficient takes at least
-COARSE = 4  # order with which the dead time is searched at first
-NEAR = 20  # control steps on both sides of what it finds, where the other orders are tried
-STRIDE = 4  # with which dead times are searched at first, or half of the order
-EPISODE = (100, 400)  # control steps of an episode of four settling times, unless y does not settle in half of them
+EACH = 8  # least rows per coefficient
+COARSE = 4  # order of the first search for the dead time
+NEAR = 20  # control steps on both sides of its best, where the other orders are tried
+STRIDE = 4  # of the first search over dead times; at least half the order
+EPISODE = (100, 400)  # bounds on an episode of four settling times, in control steps; longer if y settles too slowly
 LONGEST_EPISODE = 2_000  # control steps
-FINE = 8  # order up to which a dead time is told to a step; beyond, b covers what lies between
-LONGEST = 2_000  # rows of each third by which order and dead time are chosen
-PARSIMONY = 3e-3  # error of the free run, as share of the standard deviation of y, that a smaller order may cost
-LITTLE = 0.1  # of the moves of y in a step, that a model may leave untold
-ROUNDING = 1e-9  # of a pole, which may be that of an integrator
+FINE = 8  # up to this order every dead time is tried; for higher ones b covers those between
+LONGEST = 2_000  # rows of each third used to choose order and dead time
+PARSIMONY = 3e-3  # increase of the free-run error, in standard deviations of y, accepted for a smaller order
+LITTLE = 0.1  # one-step error of a good model, as share of the standard deviation of y's changes
+ROUNDING = 1e-9  # a pole within this of 1 may be an integrator
 LEAST_HISTORY = 5  # past samples in the observation
-AGREE = 0.9  # of the members must be able to hold a set-point
+AGREE = 0.9  # share of the members that must be able to hold a set-point
 
 
 class RecordedData(NamedTuple):
@@ -46,7 +46,7 @@ class RecordedData(NamedTuple):
 
     @property
     def step(self) -> float:
-        """The control step, without the last digits of the times."""
+        """The control step, rounded to nine digits."""
         return float(f"{(self.time[-1] - self.time[0]) / (len(self.time) - 1):.9g}")
 
     def rows(self, first: int, end: int) -> RecordedData:
@@ -55,17 +55,17 @@ class RecordedData(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """Models of one record."""
+    """Models of one record: the nominal one, and an ensemble that shows how uncertain it is."""
 
     order: int
-    dead: int  # dead time in control steps beyond the one of sampling; a member may have one more or less
+    dead: int  # dead time in control steps, in addition to the one of sampling; a member may have one more or less
     nominal: Model  # fitted to all rows
     members: tuple[Model, ...]  # fitted to blocks of rows drawn with replacement
-    redrawn: int  # members that were unstable, and drawn again
+    redrawn: int  # unstable members that were drawn again
 
 
 def read(path: str | Path) -> RecordedData:
-    """The record in a CSV or Parquet file with the columns time, r_tilde and y; others are left alone.
+    """Read a record from a CSV or Parquet file with the columns time, r_tilde and y; others are ignored.
 
     Raises:
         ValueError: names the file, the row (of the data, from 1 on), and what is allowed.
@@ -84,7 +84,7 @@ def read(path: str | Path) -> RecordedData:
 
 
 def _check(data: RecordedData) -> None:
-    """Raises ValueError, naming row and what is allowed."""
+    """Raises ValueError; names the row and what is allowed."""
     for name, column in data._asdict().items():
         bad = np.flatnonzero(~np.isfinite(column))
         if len(bad):
@@ -97,7 +97,7 @@ def _check(data: RecordedData) -> None:
         (steps <= 0.0, "it must increase from row to row"),
         (
             np.abs(steps - typical) > JITTER * typical,
-            f"the step must be constant within {JITTER:.1%}, here {typical:g}: cut the record, sample it anew, or "
+            f"the step must be constant within {JITTER:.1%}, here {typical:g}: cut the record, resample it, or "
             "write time with more digits",
         ),
     ):
@@ -112,12 +112,12 @@ def _check(data: RecordedData) -> None:
 
 
 def free_run(model: Model, data: RecordedData, first: int, rows: int) -> np.ndarray:
-    """Y in so many rows from `first` on by the model alone, which knows y before them and r~ throughout; (rows,).
+    """Simulated y of `rows` rows from `first` on, given the measured y before them and r~ throughout; (rows,).
 
     Args:
         model: stable.
-        data: at least as many rows before `first` as the model looks back.
-        first, rows: which.
+        data: with at least as many rows before `first` as the model looks back.
+        first, rows: start and length.
     """
     level, delayed, past = offset(model), np.append(0.0, model.b), np.append(1.0, -model.a)
     known = lfiltic(delayed, past, data.y[:first][::-1] - level, data.r_tilde[:first][::-1])
@@ -125,22 +125,22 @@ def free_run(model: Model, data: RecordedData, first: int, rows: int) -> np.ndar
 
 
 def fit(data: RecordedData, n: int, dead: int, rows: np.ndarray) -> Model:
-    """The model by least squares of e.
+    """Fit a model by least squares.
 
     Args:
         data: the record.
-        n, dead: order; dead time in control steps beyond the one of sampling.
-        rows: (episodes, T + 1), consecutive rows that count.
+        n, dead: order; dead time in control steps, in addition to the one of sampling.
+        rows: (episodes, T + 1), blocks of consecutive rows to fit.
     """
     return as_model(fit_arx(Record(data.r_tilde[rows[:, :-1]], data.y[rows]), n, dead))
 
 
 def choose(data: RecordedData) -> tuple[int, int]:
-    """Order and dead time whose free run is nearest to y on rows that the fit has not seen.
+    """Order and dead time with the least free-run error in three-fold cross-validation.
 
-    Each third of the record is told by models of the two others. Of the orders that are about as good the smallest is
-    taken, and of its dead times the longest. Noise of a sensor takes a high order: least squares are unbiased only
-    where the order is enough for the noise too.
+    Each third of the record is predicted by models of the two others. The smallest order that is about as good is
+    taken, with its longest dead time that is. Sensor noise needs a high order: least squares are unbiased only if the
+    order suffices for the noise too.
 
     Raises:
         ValueError: every model is unstable.
@@ -153,7 +153,7 @@ def choose(data: RecordedData) -> tuple[int, int]:
     near = min(coarse, key=lambda dead: coarse[dead])
     errors: dict[int, dict[int, float]] = {}  # by order, then dead time
     for n in (n for n in ORDERS if n == 1 or EACH * (2 * n + 1) <= 2 * third):
-        longest = max(0, third - EACH * (2 * n + 1) // 2)  # that leaves rows enough
+        longest = max(0, third - EACH * (2 * n + 1) // 2)  # leaves enough rows
         first = max(0, min(near - NEAR, longest))
         tried = range(first, max(first, min(near + NEAR, most, longest)) + 1, max(STRIDE, n // 2))
         of_n = errors[n] = {dead: _error(data, rows, n, dead) for dead in tried}
@@ -171,7 +171,7 @@ def choose(data: RecordedData) -> tuple[int, int]:
 
 
 def _must_be_best(chosen: Model, data: RecordedData, rows: np.ndarray, most: int) -> None:
-    """Raises ValueError where models that are not stable, which can't run freely, tell far more a step ahead."""
+    """Raises ValueError if an unstable or integrating model predicts one step ahead far better."""
     if chosen.sigma > LITTLE * np.std(np.diff(data.y)):
         tried = (fit(data, COARSE, dead, rows) for dead in range(0, most + 1, STRIDE))
         best = min(tried, key=lambda model: model.sigma)
@@ -180,14 +180,14 @@ def _must_be_best(chosen: Model, data: RecordedData, rows: np.ndarray, most: int
 
 
 def _look_near(dead: int, data: RecordedData, rows: np.ndarray, n: int, errors: dict[int, float], most: int) -> None:
-    """Adds the errors of the dead times that the stride has left out beside this one."""
+    """Add the errors of the dead times next to this one that the stride left out."""
     for each in range(max(0, dead - STRIDE + 1), min(most, dead + STRIDE - 1) + 1) if n <= FINE else ():
         if each not in errors:
             errors[each] = _error(data, rows, n, each)
 
 
 def _error(data: RecordedData, rows: np.ndarray, n: int, dead: int) -> float:
-    """Root mean square error of the free run in each third (3, T) of the model of the others; inf where unstable."""
+    """Free-run RMSE on each third (3, T) of the model fitted to the others; inf if one is unstable."""
     total = 0.0
     for i, held_out in enumerate(rows):
         model, first = fit(data, n, dead, np.delete(rows, i, 0)), held_out[0] + n + dead
@@ -199,20 +199,20 @@ def _error(data: RecordedData, rows: np.ndarray, n: int, dead: int) -> float:
 
 
 def ensemble(data: RecordedData, members: int = 16, seed: int = 0, shape: tuple[int, int] | None = None) -> Ensemble:
-    """Models of the record: the nominal one of all rows, and those of resampled rows (moving block bootstrap).
+    """Models of the record: the nominal one of all rows, and members of resampled rows (moving block bootstrap).
 
-    The blocks are twice as long as the nominal model remembers, where there are eight of them. A member of a low order
-    takes the dead time, the nominal one or a step beside it, that fits its rows best. Unstable ones are drawn again.
+    The blocks are twice as long as the nominal settling time, or an eighth of the record if that is shorter. Members of
+    a low order choose the dead time within a step of the nominal one. Unstable members are drawn again.
 
     Args:
-        data: what is fitted.
-        members: how many.
-        seed: of the blocks.
-        shape: order and dead time; None: `choose` of the first three quarters of the record, so that no choice
-            has seen the last one.
+        data: record.
+        members: number of members.
+        seed: for drawing blocks.
+        shape: order and dead time; None: chosen on the first three quarters of the record, so that the last one stays
+            unseen for validation.
 
     Raises:
-        ValueError: the models are unstable, or there are too few members.
+        ValueError: the models are unstable, or `members` is too small.
     """
     if members < 2:
         raise ValueError(f"members is {members}; it must be at least 2")
@@ -242,7 +242,7 @@ def ensemble(data: RecordedData, members: int = 16, seed: int = 0, shape: tuple[
 
 
 def _unsettled(model: Model, rows: int) -> str:
-    """Why no plant is made of a record with this model."""
+    """Why this model is no basis for a plant."""
     found = {
         "unstable": "the models of this record are unstable",
         "integrating": "y integrates r~ in this record",
@@ -255,17 +255,17 @@ def _unsettled(model: Model, rows: int) -> str:
 
 
 def without_last_quarter(data: RecordedData, models: Ensemble, seed: int = 0) -> Ensemble:
-    """Models of the same order and dead time, of the first three quarters of the record alone."""
+    """Models of the same order and dead time, fitted to the first three quarters of the record."""
     return ensemble(data.rows(0, 3 * len(data.time) // 4), len(models.members), seed, (models.order, models.dead))
 
 
 def _padded(model: Model, memory: int) -> Model:
-    """With b of so many coefficients."""
+    """The model with b padded to `memory` coefficients."""
     return model._replace(b=np.append(model.b, np.zeros(memory - len(model.b))))
 
 
 def identified(path: str | Path, members: int = 16, seed: int = 0) -> tuple[RecordedData, Ensemble]:
-    """The record in a file and its models, made once for each content of the file."""
+    """The record in a file and its models; cached until the file changes."""
     path = Path(path).absolute()
     stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
     return _identified(path, stamp, members, seed)
@@ -277,17 +277,17 @@ def _identified(path: Path, stamp: Any, members: int, seed: int) -> tuple[Record
     data = read(path)
     try:
         models = ensemble(data, members, seed)
-        without_last_quarter(data, models, seed)  # what can't be validated is refused here, for all commands alike
+        without_last_quarter(data, models, seed)  # refuse here, for all commands, what can't be validated
         return data, models
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def set_points(data: RecordedData, models: Ensemble, r_tilde_bounds: tuple[float, float]) -> tuple[float, float]:
-    """What nine of ten members can hold within the bounds of r~, as far as it has been seen.
+    """Range of y that nine of ten members can hold within the bounds of r~ and that the record has reached.
 
     Raises:
-        ValueError: there is nothing of the kind.
+        ValueError: there is no such range.
     """
     ends = np.sort([[gain(model) * r_tilde + offset(model) for r_tilde in r_tilde_bounds] for model in models.members])
     low = max(float(np.quantile(ends[:, 0], AGREE)), float(data.y.min()))
@@ -301,23 +301,23 @@ def set_points(data: RecordedData, models: Ensemble, r_tilde_bounds: tuple[float
 
 
 def make(name: str, path: str, options: PlantOptions = PlantOptions()) -> tuple[Plant, arx.ARXParams]:  # noqa: B008
-    """The plant of a record, and its parameters: undrawn the model of all rows, drawn a member of the ensemble.
+    """The plant of a record, and its parameters: the nominal model; each training episode draws a member.
 
-    r~ stays within what the record has seen, set-points within what nine of ten members hold by it; an episode is four
-    settling times long, within 100 to 400 control steps; unless the options say otherwise.
+    Unless the options say otherwise, r~ stays in its recorded range, set-points in the range that nine of ten members
+    can hold, and an episode is four settling times long, within 100 to 400 control steps.
 
     Args:
         name: of the plant.
         path: CSV or Parquet file, see `read`; time in s.
-        options: what is known beside the record.
+        options: what is known in addition to the record.
 
     Raises:
-        ValueError: the record is not what it must be, or does not tell enough.
+        ValueError: the record is malformed, or not informative enough.
     """
     if (options.control_step, options.input, options.output) != (None, None, None):
         raise ValueError(
-            "recorded data tell their control step, and have one r~ and one y: leave --control-step, --input and "
-            "--output away"
+            "recorded data define the control step and have one r~ and one y; leave out --control-step, --input and "
+            "--output"
         )
     data, models = identified(path)
     bounds = options.r_tilde_bounds or (float(data.r_tilde.min()), float(data.r_tilde.max()))

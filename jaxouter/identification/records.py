@@ -1,4 +1,4 @@
-"""Records of a plant under random r~: what identification is made from."""
+"""Records of a plant under random r~, the data for identification."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from jaxouter.plants.base import RUN_ONCE
 
 
 class Record(NamedTuple):
-    """Signals of exciting episodes, oldest first."""
+    """Signals of excited episodes, oldest first."""
 
     r_tilde: np.ndarray  # (episodes, T), held over each control step
     y: np.ndarray  # (episodes, T + 1), y_0 to y_T
 
 
 def record(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> Record:
-    """Input and output under random r~: levels over its whole range, held long in some episodes, briefly in others.
+    """Record r~ and y under random levels of r~ over its whole range.
 
-    Each episode starts like a training episode. The probability that a level is redrawn at a step is drawn for each,
-    log-uniform from four times an episode to every other step.
+    Each episode starts like a training episode and has its own rate of redrawing the level, log-uniform from four times
+    per episode to every other step.
     """
     keys, n = jax.random.split(key, episodes), host.side_by_side(plant) or episodes
     parts = [_episodes(plant, params, keys[i : i + n]) for i in range(0, episodes, n)]
@@ -51,7 +51,7 @@ def _episodes(plant: Plant, params: Any, keys: chex.PRNGKey) -> tuple[jax.Array,
 
 
 def within(data: Record, bounds: tuple[float, float]) -> Record:
-    """The record without what came after y had left the bounds, by far: there it is nan."""
+    """The record with y replaced by nan from where it leaves the bounds by far."""
     low, high = bounds
     far = 4.0 * (high - low)
     gone = np.maximum.accumulate(~((data.y >= low - far) & (data.y <= high + far)), axis=1)

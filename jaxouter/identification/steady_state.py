@@ -1,6 +1,6 @@
-"""Where y comes to under a constant r~: the DC gain, and its inverse, the static prefilter.
+"""Steady state of y under a constant r~: the DC gain, and its inverse, the static prefilter.
 
-It is seen through r~ and y alone; no parameter of the plant is read.
+Identified from r~ and y alone; no parameter of the plant is read.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from jaxouter.plants import Plant, host, simulate
 from jaxouter.plants.base import RUN_ONCE
 
 LEVELS = 8
-DRIFT = 0.08  # of the gain, by which it may still change in a fifth of an episode where y has settled
-GROWTH = 1.5  # of the swings of y from a fifth of an episode to the next, from which it runs away
-STEADY = (0.97, 1.05)  # ratio of the changes in two such fifths, where y grows as that of an integrator does
-SIGNIFICANT = 3.0  # standard errors, by which y must have moved with r~
-TINY = 1e-3  # of the span of the set-points, by which all of r~ must move y
-LONGER = 5  # episodes, in which y is seen to move at last
-ROUNDING = 1e-6  # of y
+DRIFT = 0.08  # share of the gain by which it may change in a fifth of an episode if y has settled
+GROWTH = 1.5  # y runs away if its swings grow by this from a fifth of an episode to the next
+STEADY = (0.97, 1.05)  # y integrates if the ratio of its changes in two such fifths lies in this range
+SIGNIFICANT = 3.0  # standard errors by which y must move with r~
+TINY = 1e-3  # share of the set-point range by which the whole range of r~ must move y
+LONGER = 5  # episodes to wait for a long dead time
+ROUNDING = 1e-6  # relative to y
 
 
 class IdentificationWarning(UserWarning):
-    """What was identified does not mean what it usually does."""
+    """An identified quantity does not have its usual meaning."""
 
 
 class DcGain(NamedTuple):
-    """y = offset + gain * r~ in steady state; at the end of an episode where y does not settle."""
+    """y = offset + gain * r~ in steady state, or at the end of an episode if y does not settle."""
 
     gain: jax.Array
     offset: jax.Array
     unsettled: str | None = None
     """What y does instead of settling, in words."""
     rate: float = math.nan
-    """Change of y in a control step for a unit of r~, late in an episode."""
+    """Change of y per control step and unit of r~, late in an episode."""
     still: float = math.nan
-    """r~ under which y then stays where it is."""
+    """r~ under which y then stays constant."""
 
 
 def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
-    """The affine DC gain from constant-r~ episodes, one at each of 8 levels of r~ (8 episodes of environment steps).
+    """Identify the affine DC gain from 8 episodes, each with r~ constant at another level.
 
-    Each starts like a training episode; a line is fitted through the last tenth of each.
+    Episodes start like training episodes; a line is fitted through the means of their last tenths.
 
     Raises:
-        ValueError: y does not tell how it answers to r~; says why.
+        ValueError: the gain can't be found; says why.
     """
     if (simulators := host.of(plant)) is not None:
         simulators.ended = None
-    levels, y, course = map(np.asarray, _steady(plant, params, key))  # the rest on the host, where nothing is compiled
+    levels, y, course = map(np.asarray, _steady(plant, params, key))  # the rest in NumPy, which compiles nothing
     end = finite_steps(course, plant.divergence_bounds)
     if end < course.shape[1]:  # it ran away
         course = course[:, :end]
@@ -78,7 +78,7 @@ def dc_gain(plant: Plant, params: Any, key: chex.PRNGKey) -> DcGain:
 
 
 def finite_steps(y: np.ndarray, bounds: tuple[float, float]) -> int:
-    """Samples until the first of these outputs (n, T) runs away: is not finite after it has left the bounds; else T."""
+    """Samples until one of the outputs (n, T) is not finite, if one has left the bounds by then; else T."""
     low, high = bounds
     bad = ~np.isfinite(y)
     left = np.any((np.nan_to_num(y, nan=low) < low) | (np.nan_to_num(y, nan=low) > high))
@@ -86,10 +86,11 @@ def finite_steps(y: np.ndarray, bounds: tuple[float, float]) -> int:
 
 
 def unsettled(levels: np.ndarray, y: np.ndarray) -> str | None:
-    """What y does instead of coming to rest, in words; None: it has come to rest.
+    """What y does instead of settling, in words; None: it has settled.
 
-    The gain of y to r~ is followed through the last three fifths of an episode. It must have changed from the last but
-    one to the last, by more than what a line through the levels leaves unexplained, and within the last one too.
+    Follows the gain from r~ to y through the last three fifths of an episode. y has not settled if the gain changes
+    from the last fifth but one to the last, by more than the scatter about a line through the levels, and also within
+    the last fifth.
 
     Args:
         levels: of r~ (n,), one an episode.
@@ -101,7 +102,7 @@ def unsettled(levels: np.ndarray, y: np.ndarray) -> str | None:
     parts = np.stack([_part(y, steps // 5, i) for i in (2, 1, 0)] + [_part(y, steps // 10, 1)], 1)
     columns = [levels - levels.mean(), np.ones(len(levels))]
     if np.ptp(y[:, 0]) > 1e-3 * np.ptp(y):
-        columns.append(y[:, 0] - y[:, 0].mean())  # where an episode starts may still show
+        columns.append(y[:, 0] - y[:, 0].mean())  # the start of an episode may still matter
     design = np.stack(columns, 1)
     (gains, *_), *_ = np.linalg.lstsq(design, parts, rcond=None)
     before, last = np.diff(gains[:3])
@@ -114,7 +115,7 @@ def unsettled(levels: np.ndarray, y: np.ndarray) -> str | None:
     if abs(last) <= max(DRIFT * abs(gains[2]), 3.0 * chance) or abs(lately) <= DRIFT / 4.0 * abs(gains[2]):
         return None
     if before * last < 0.0:
-        return None  # y swings about where it stays
+        return None  # y oscillates about its final value
     ratio = last / before if before else math.inf
     if ratio > STEADY[1]:
         return "y runs away under a constant r~"
@@ -122,13 +123,13 @@ def unsettled(levels: np.ndarray, y: np.ndarray) -> str | None:
 
 
 def _part(y: np.ndarray, length: int, before: int) -> np.ndarray:
-    """Means (n,) of so many last samples of y (n, T), or of those before them."""
+    """Means (n,) over `length` samples of y (n, T), `before` such blocks from its end."""
     end = y.shape[1] - before * length
     return y[:, end - length : end].mean(1)
 
 
 def _rate(levels: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Change of y in a control step for a unit of r~, and the r~ under which there is none, in the second half."""
+    """Change of y per control step and unit of r~ in the second half, and the r~ under which y is constant there."""
     half = y.shape[1] // 2
     centred, change = levels - levels.mean(), (y[:, -1] - y[:, half]) / max(1, y.shape[1] - 1 - half)
     rate = float(np.dot(centred, change) / np.sum(centred**2))
@@ -137,7 +138,7 @@ def _rate(levels: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
 def _steady(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Levels of r~ (8,), where y comes to under each (8,), and its course (8, T + 1)."""
+    """Levels of r~ (8,), the final y under each (8,), and the trajectories of y (8, T + 1)."""
     low, high = plant.r_tilde_bounds
     levels = low + (high - low) * (jnp.arange(LEVELS, dtype=float) + 0.5) / LEVELS
 
@@ -160,15 +161,15 @@ def unanswered(
     course: np.ndarray,
     gain: float,
 ) -> str | None:
-    """Why y does not tell how it answers to r~; None: it does.
+    """Why the DC gain can't be found; None: it can.
 
     Args:
-        plant, params: stepped again only where it seems not to.
-        key: of the starts.
-        levels: of r~ (8,), one an episode.
-        y: (8,), where it comes to under each.
+        plant, params: simulated again only if y seems not to respond.
+        key: for the starts.
+        levels: of r~ (8,), one per episode.
+        y: (8,), its final value under each.
         course: (8, T + 1), y_0 to y_T.
-        gain: of the line through y.
+        gain: slope of the line through y.
     """
     steps = course.shape[1] - 1
     broken = ~np.isfinite(course)
@@ -179,7 +180,7 @@ def unanswered(
         why = "" if ended is None else f": {ended}; choose --episode-steps so that an episode is over by then"
         return f"y is {value} from control step {k} of {steps} on under r~ = {level:g}{why}"
     (low, high), setpoints = plant.r_tilde_bounds, np.ptp(plant.setpoint_range)
-    # Where y began counts too: what is left of it at the end is no answer to r~.
+    # The initial y is a regressor too: what remains of it at the end is no response to r~.
     causes = np.stack([np.ones(LEVELS), levels / (high - low), course[:, 0] / setpoints], 1)
     effect, *_ = np.linalg.lstsq(causes, y / setpoints, rcond=None)
     spread = np.std(y / setpoints - causes @ effect) / np.std(causes[:, 1]) / np.sqrt(LEVELS - 3)
@@ -191,19 +192,19 @@ def unanswered(
         same = f"y is the same under {LEVELS} levels of r~ from {levels[0]:g} to {levels[-1]:g}"
         if longer.any():
             return (
-                f"{same} for {int((longer > 0).argmax())} control steps, its dead time, and an episode has {steps}: "
-                "make it several times as long as the dead time (episode_steps)"
+                f"{same} for {int((longer > 0).argmax())} control steps (the dead time), and an episode has {steps}; "
+                "make episodes several times as long as the dead time (episode_steps)"
             )
         return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
     most = float(moved.max())
     if most < TINY * setpoints:
         return (
-            f"all of r~, {low:g} to {high:g} {plant.y_unit}, moves y by {most:.3g} {plant.y_unit}, and its set-points "
-            f"span {setpoints:.3g} {plant.y_unit}: a gain so small holds none of them"
+            f"r~ from {low:g} to {high:g} {plant.y_unit} moves y by only {most:.3g} {plant.y_unit}, but the set-points "
+            f"span {setpoints:.3g} {plant.y_unit}: the gain is too small to hold them"
         )
     if abs(gain) * (high - low) > TINY * setpoints:
-        return None  # in spite of the noise
-    return f"y does not move one way as r~ rises: it comes to {_numbers(y)} at r~ of {_numbers(levels)}"
+        return None  # significant in spite of the noise
+    return f"y neither rises nor falls steadily with r~: it settles at {_numbers(y)} for r~ of {_numbers(levels)}"
 
 
 def _numbers(values: np.ndarray) -> str:
@@ -211,13 +212,13 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def _moved(plant: Plant, params: Any, key: chex.PRNGKey, levels: np.ndarray, steps: int) -> np.ndarray:
-    """By how much the levels of r~ move y apart, (T,), less rounding; as far as the plant goes on, at most `steps`.
+    """Spread of y over the levels of r~, (T,), 0 if it is only rounding; T is `steps` or where the plant ends.
 
-    All have the same start and noise.
+    All levels have the same start and noise.
     """
     try:
         y = np.asarray(_together(plant, steps, params, key, levels))
-    except (ValueError, jax.errors.JaxRuntimeError):  # a simulator that does not go on
+    except (ValueError, jax.errors.JaxRuntimeError):  # a simulator that ends
         return np.zeros(plant.episode_steps)
     y = y[:, : int(np.append(~np.isfinite(y).all(0), True).argmax())]
     return np.where(np.ptp(y, 0) > ROUNDING * np.abs(y).max(initial=0.0), np.ptp(y, 0), 0.0)
@@ -238,7 +239,7 @@ def _together(plant: Plant, steps: int, params: Any, key: chex.PRNGKey, levels: 
 def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, AffineParams]:
     """The static prefilter: the inverse of the identified affine DC gain, r~ = (r - offset) / gain.
 
-    Where y does not settle it is r~ = r, with a warning.
+    If y does not settle it is r~ = r, with a warning.
     """
     identified = dc_gain(plant, params, key)
     warn_unsettled(identified.unsettled)
@@ -246,14 +247,14 @@ def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, Affine
 
 
 def prefilter(plant: Plant, identified: DcGain) -> tuple[Affine, AffineParams]:
-    """The inverse of the DC gain; r~ = r where there is none."""
+    """The inverse of the DC gain; r~ = r if there is none."""
     if identified.unsettled is not None:
         return none(plant)
     return Affine(plant.r_tilde_bounds), AffineParams(1.0 / identified.gain, -identified.offset / identified.gain)
 
 
 def warn_unsettled(unsettled: str | None) -> None:
-    """Warns that there is no static prefilter, where y does not settle."""
+    """Warn that there is no static prefilter if y does not settle."""
     if unsettled is not None:
         text = f"{unsettled}; there is no DC gain to invert, so the static prefilter is r~ = r"
         warnings.warn(text, IdentificationWarning, stacklevel=3)

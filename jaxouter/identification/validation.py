@@ -1,4 +1,4 @@
-"""Model validation: what models of recorded data predict of rows that they have not seen, and what is not excited."""
+"""Model validation: how well models of recorded data predict unseen rows, and what the record does not excite."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ Intervals = tuple[tuple[float, float], ...]
 
 LONGEST_RUN = 1_000  # rows of a free run
 BINS = 20  # levels of r~
-COHERENT = 0.5  # from this on y shows r~ rather than noise
-PATHS = 10  # of noise for each member
-SPREAD = (0.05, 0.95)  # quantiles of the ensemble that are told
-QUANTILES = 8  # levels of y by which the error may differ
+COHERENT = 0.5  # coherence above which y shows r~ rather than noise
+PATHS = 10  # noise realisations per member
+SPREAD = (0.05, 0.95)  # quantiles of the ensemble that are reported
+QUANTILES = 8  # levels of y over which the error is compared
 
 
 class Curves(NamedTuple):
-    """What the picture is drawn from."""
+    """Data of the validation figure."""
 
     time: np.ndarray  # (T,), of the held-out free run
     y: np.ndarray  # (T,)
     free_run: np.ndarray  # (T,)
     band: np.ndarray  # (2, T), 90 % of the ensemble with its noise
-    responses: np.ndarray  # (members + 1, S), to a unit step of r~ at 0; the nominal one first
-    levels: np.ndarray  # (BINS,), share of the time that r~ was there
+    responses: np.ndarray  # (members + 1, S), to a unit step of r~ at 0; the nominal model first
+    levels: np.ndarray  # (BINS,), share of time that r~ spent in each bin
     edges: np.ndarray  # (BINS + 1,)
-    frequency: np.ndarray  # (F,), in cycles a unit of time
+    frequency: np.ndarray  # (F,), in cycles per unit of time
     coherence: np.ndarray  # (F,)
     power: np.ndarray  # (F,), of r~
 
 
 class Validation(NamedTuple):
-    """What a record tells; times in its unit of time, frequencies in cycles a unit of time."""
+    """Results of the validation; times in the record's unit of time, frequencies in cycles per unit of time."""
 
     rows: int
     control_step: float
@@ -50,20 +50,20 @@ class Validation(NamedTuple):
     settling_time: float  # to 5 % of a step
     length: float  # of the record, in settling times
     moves: int  # of r~
-    moves_held_out: int  # of them in the last quarter
-    error_one_step: float  # on the last quarter, by a model of the rest: RMSE
+    moves_held_out: int  # moves of r~ in the last quarter
+    error_one_step: float  # RMSE on the last quarter, of a model of the rest
     error_free_run: float
-    fit_one_step: float  # share of the variance of y that is told
+    fit_one_step: float  # share of the variance of y that is explained
     fit_free_run: float
-    coverage: float  # share of that quarter's y within the band that should hold 90 %
+    coverage: float  # share of that quarter's y within the ensemble's 90 % band
     bias: float  # mean error of that free run, in standard deviations of y
-    nonlinearity: float  # part of the error of a free run that depends on the level of y, likewise
-    levels_seen: float  # share of the range of r~
+    nonlinearity: float  # part of a free run's error that depends on the level of y, in standard deviations of y
+    levels_seen: float  # share of the range of r~ that it visited
     levels_unseen: Intervals
-    needed: float  # frequencies up to here matter: one over the rise time
+    needed: float  # highest frequency that matters: one over the rise time
     excited: Intervals  # frequencies at which y shows r~
-    excited_share: float  # of what is needed
-    redrawn: int  # members that were unstable
+    excited_share: float  # excited share of the frequencies up to `needed`
+    redrawn: int  # unstable members that were drawn again
     warnings: tuple[str, ...]
     curves: Curves
 
@@ -71,18 +71,18 @@ class Validation(NamedTuple):
 def validate(data: RecordedData, models: Ensemble, seed: int = 0) -> Validation:
     """Validate the models of recorded data.
 
-    The errors are those of the models of its first three quarters on the last one, which had no part in the choice of
-    order and dead time either.
+    Errors are on the last quarter of the record, by models of the first three. The last quarter had no part in the
+    choice of order and dead time either.
 
     Args:
-        data: as `read` gives it.
+        data: as returned by `read`.
         models: of the whole record.
-        seed: of blocks and noise.
+        seed: for blocks and noise.
     """
     cut = 3 * len(data.time) // 4
     tried = without_last_quarter(data, models, seed)
     rows = min(len(data.time) - cut, LONGEST_RUN)
-    y, told = data.y[cut : cut + rows], free_run(tried.nominal, data, cut, rows)
+    y, predicted = data.y[cut : cut + rows], free_run(tried.nominal, data, cut, rows)
     one_step = _one_step(tried.nominal, data, cut)
     band = _band(tried, data, cut, rows, np.random.default_rng(seed))
     spread, of_these = float(np.std(data.y)), max(float(np.std(data.y[cut:])), 1e-9 * float(np.std(data.y)))
@@ -106,11 +106,11 @@ def validate(data: RecordedData, models: Ensemble, seed: int = 0) -> Validation:
         moves=int(np.count_nonzero(np.diff(data.r_tilde))),
         moves_held_out=int(np.count_nonzero(np.diff(data.r_tilde[cut:]))),
         error_one_step=_root_mean_square(one_step),
-        error_free_run=_root_mean_square(y - told),
+        error_free_run=_root_mean_square(y - predicted),
         fit_one_step=1.0 - (_root_mean_square(one_step) / of_these) ** 2,
-        fit_free_run=1.0 - (_root_mean_square(y - told) / of_these) ** 2,
+        fit_free_run=1.0 - (_root_mean_square(y - predicted) / of_these) ** 2,
         coverage=float(np.mean((y >= band[0]) & (y <= band[1]))),
-        bias=float(np.mean(y - told)) / spread,
+        bias=float(np.mean(y - predicted)) / spread,
         nonlinearity=_nonlinearity(models.nominal, data, settled) / spread,
         levels_seen=float(np.mean(levels > 0)),
         levels_unseen=_runs(levels == 0, edges),
@@ -122,7 +122,7 @@ def validate(data: RecordedData, models: Ensemble, seed: int = 0) -> Validation:
         curves=Curves(
             time=data.time[cut : cut + rows],
             y=y,
-            free_run=told,
+            free_run=predicted,
             band=band,
             responses=np.stack([step_response(model, 2 * settled + 2) for model in (models.nominal, *models.members)]),
             levels=levels / len(data.r_tilde),
@@ -140,14 +140,14 @@ def _root_mean_square(errors: np.ndarray) -> float:
 
 
 def _one_step(model: Model, data: RecordedData, first: int) -> np.ndarray:
-    """What the model does not tell a step ahead, of the rows from `first` on."""
+    """One-step prediction errors of the rows from `first` on."""
     of_y = signal.lfilter(np.append(1.0, -model.a), [1.0], data.y)
     of_r_tilde = signal.lfilter(np.append(0.0, model.b), [1.0], data.r_tilde)
     return (np.asarray(of_y) - np.asarray(of_r_tilde))[first:] - model.c
 
 
 def _band(models: Ensemble, data: RecordedData, first: int, rows: int, rng: np.random.Generator) -> np.ndarray:
-    """Quantiles of what the members with their noise make of the rows from `first` on; (2, rows)."""
+    """Quantiles of the members' simulated y, with noise, in the rows from `first` on; (2, rows)."""
     paths = [
         free_run(model, data, first, rows)
         + signal.lfilter([1.0], np.append(1.0, -model.a), model.sigma * rng.standard_normal((PATHS, rows)))
@@ -173,12 +173,12 @@ def _excitation(data: RecordedData, settled: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _nonlinearity(model: Model, data: RecordedData, settled: int) -> float:
-    """Root mean square of the mean error of a free run at each level, beyond what chance makes of it."""
+    """RMS over the levels of y of a free run's mean error at each, less what chance would give."""
     first = min(len(model.b) + settled, len(data.time) // 2)
-    told = free_run(model, data, first, len(data.time) - first)
-    error = data.y[first:] - told
+    predicted = free_run(model, data, first, len(data.time) - first)
+    error = data.y[first:] - predicted
     error = error - error.mean()
-    of_level = np.searchsorted(np.unique(np.quantile(told, np.linspace(0.0, 1.0, QUANTILES + 1)[1:-1])), told)
+    of_level = np.searchsorted(np.unique(np.quantile(predicted, np.linspace(0.0, 1.0, QUANTILES + 1)[1:-1])), predicted)
     rows = np.bincount(of_level)
     means = np.bincount(of_level, error) / np.maximum(rows, 1)
     chance = np.var(error) * QUANTILES * settled / len(error)
@@ -191,59 +191,59 @@ def _edges(centres: np.ndarray) -> np.ndarray:
 
 
 def _runs(true: np.ndarray, edges: np.ndarray) -> Intervals:
-    """Where a condition holds, as intervals between the edges of its bins."""
+    """Bins in which a condition holds, as intervals between their edges."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(int)))
     return tuple((float(edges[a]), float(edges[b])) for a, b in zip(change[::2], change[1::2], strict=True))
 
 
-def _told(intervals: Sequence[tuple[float, float]]) -> str:
+def _listed(intervals: Sequence[tuple[float, float]]) -> str:
     return ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals)
 
 
 def _gaps(found: Validation) -> Intervals:
-    """Frequencies that matter at which y does not show r~."""
+    """Frequencies that matter but at which y does not show r~."""
     frequency, coherence = found.curves.frequency, found.curves.coherence
     matter = frequency <= max(found.needed, frequency[0])
     return _runs(coherence[matter] <= COHERENT, _edges(frequency)[: np.count_nonzero(matter) + 1])
 
 
 def _warnings(it: Validation) -> list[str]:
-    """What is weak, and what to do about it."""
+    """What is weak about the record or the models, and what to do about it."""
     low, high = it.gain_range
     weak = {
         f"the record is only {it.length:.3g} settling times long; 20 or more show how much the models may differ": (
             it.length < 20
         ),
-        f"r~ moves only {it.moves} times; each move is one look at how y answers, so move it 20 times or more": (
+        f"r~ moves only {it.moves} times; each move shows once how y responds, so move it 20 times or more": (
             it.moves < 20
         ),
-        f"the DC gain is known to {low:.3g} to {high:.3g} only; hold r~ at several levels until y has settled": (
+        f"the DC gain is only known to be {low:.3g} to {high:.3g}; hold r~ at several levels until y has settled": (
             high - low > 0.2 * abs(it.gain)
         ),
         f"r~ moves only {it.moves_held_out} times in the last quarter; what is predicted there says little": (
             it.moves_held_out < 3
         ),
-        f"r~ was never at {_told(it.levels_unseen)}; whether y is as linear there is a guess": it.levels_seen < 0.7,
-        f"y does not show r~ at the frequencies {_told(_gaps(it))} (coherence below {COHERENT:g}), of those up to "
-        f"{it.needed:.3g} that an outer loop needs; let r~ move at such rates, or further": it.excited_share < 0.8,
-        f"a model of the rest tells only {max(it.fit_free_run, 0.0):.0%} of the variance of y in the last quarter, in "
-        "free run; a controller from it is a guess": it.fit_free_run < 0.8,
-        f"only {it.coverage:.0%} of the last quarter lies where the ensemble expects 90 %; the plant differs from it "
-        "by more than the ensemble spreads": it.coverage < 0.75 and it.fit_free_run < 0.999,
-        f"in the last quarter y is off by {abs(it.bias):.2g} of its standard deviation on the mean: a load, or a "
-        "drift, that the ensemble does not know": abs(it.bias) > 0.2,
+        f"r~ was never at {_listed(it.levels_unseen)}; whether y is as linear there is a guess": it.levels_seen < 0.7,
+        f"y does not show r~ at the frequencies {_listed(_gaps(it))} (coherence below {COHERENT:g}), but an outer loop "
+        f"needs those up to {it.needed:.3g}; move r~ at such rates, or by more": it.excited_share < 0.8,
+        f"a model of the rest explains only {max(it.fit_free_run, 0.0):.0%} of the variance of y in the last quarter "
+        "(free run); a controller based on it is a guess": it.fit_free_run < 0.8,
+        f"only {it.coverage:.0%} of the last quarter lies in the 90 % band of the ensemble; the plant differs from the "
+        "nominal model by more than the ensemble does": it.coverage < 0.75 and it.fit_free_run < 0.999,
+        f"in the last quarter y is off by {abs(it.bias):.2g} standard deviations on average: a load or a drift that "
+        "the ensemble does not know": abs(it.bias) > 0.2,
         f"the error depends on the level of y, by {it.nonlinearity:.2g} of its standard deviation: the plant is not "
         "linear; keep set-points to a narrower range": it.nonlinearity > 0.05,
         f"{it.redrawn} members were unstable and drawn again": it.redrawn > 0,
         "y rises within two control steps; a shorter step would show how": it.rise_time < 2.5 * it.control_step,
-        f"y takes {it.rise_time / it.control_step:.0f} control steps to rise; with every n-th row, so that "
-        "it takes 5 to 20, the outer loop would see further back": it.rise_time > 150 * it.control_step,
+        f"y takes {it.rise_time / it.control_step:.0f} control steps to rise; keep every n-th row only, so that it "
+        "takes 5 to 20, and the outer loop sees further back": it.rise_time > 150 * it.control_step,
     }
     return [text for text, is_weak in weak.items() if is_weak]
 
 
 def table(found: Validation, y_unit: str = "1", time_unit: str = "s") -> list[tuple[str, str]]:
-    """The validation as rows of a table: what, and how much."""
+    """The validation as rows of a table: quantity, value."""
     y, t = "" if y_unit in ("", "1") else f" {y_unit}", time_unit
     low, high = found.gain_range
     return [

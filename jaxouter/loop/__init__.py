@@ -1,1 +1,1 @@
-"""What surrounds a plant: references, rewards, sensor, observation, policies, identification, the environment."""
+"""What surrounds a plant: references, rewards, sensor, observation, policies, the closed loop, the environment."""

@@ -1,7 +1,7 @@
-"""The closed loop, one control step at a time: policy, plant, sensor, reward. Whoever runs a loop runs this one.
+"""One control step of the closed loop: policy, plant, sensor, reward. Every roll-out uses this code.
 
-At t_k the policy sees r_k and the measured y_k and chooses r~_k, which the plant is shown until t_(k+1). What differs
-from caller to caller is handed in: how y is measured, and what becomes of an output or an r~ that is no number.
+At t_k the policy sees r_k and the measured y_k and chooses r~_k, which is held until t_(k+1). Callers pass in what
+differs: how y is measured (`Measure`), and how an output that is not finite is treated (`Treat`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from jaxouter.loop.rewards import RewardParams
 from jaxouter.plants import Plant
 
 Measure = Callable[[jax.Array, jax.Array], jax.Array]
-"""`measure(y, last) -> y_seen`: what the sensor gives of y, when it gave `last` before."""
+"""`measure(y, last) -> y_seen`: what the sensor reads, given the true y and its last reading."""
 Treat = Callable[[jax.Array, jax.Array], tuple[jax.Array, Any]]
-"""`treat(r_tilde, y) -> y, found`: what stands for the output after r~, and what the caller wants to know of it."""
+"""`treat(r_tilde, y) -> y, found`: the output to go on with after r~, and any result for the caller."""
 
 
 class LoopState(NamedTuple):
-    """State of the loop without its policy at t_k."""
+    """State of the loop at t_k, without the policy's."""
 
     plant: Any
     y: jax.Array  # true output
@@ -40,13 +40,13 @@ def exactly(y: jax.Array, last: jax.Array) -> jax.Array:
 
 
 def as_it_is(r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, tuple[()]]:
-    """The output that the plant gives."""
+    """The plant's output, unchanged."""
     del r_tilde
     return y, ()
 
 
 def begin(plant: Plant, params: Any, state: Any, measure: Measure = exactly) -> LoopState:
-    """The loop at t_0, from the plant's parameters and state; r~_(-1) is y_0 within the bounds of r~."""
+    """The loop at t_0, from the plant's parameters and state; r~_(-1) is y_0 clipped to the bounds of r~."""
     y = plant.output(params, state)
     return LoopState(state, y, measure(y, y), jnp.clip(y, *plant.r_tilde_bounds))
 
@@ -63,7 +63,7 @@ def advance(
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
 ) -> tuple[LoopState, jax.Array, Any]:
-    """One control step under r~ (scalar), which is clipped to its bounds.
+    """One control step under r~ (scalar), clipped to its bounds.
 
     Args:
         plant, params: the plant and its parameters, unbatched.
@@ -72,10 +72,10 @@ def advance(
         r, r_tilde: r_k and r~_k.
         key: randomness of the plant.
         measure, treat: see `Measure` and `Treat`.
-        load: added to r~ unseen, at the plant alone.
+        load: disturbance that is added to r~ at the plant; neither reward nor observation sees it.
 
     Returns:
-        The state at t_(k+1), the reward of the true outputs, and what `treat` found.
+        The state at t_(k+1), the reward on the true outputs, and the result of `treat`.
     """
     r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
     plant_state = plant.step(params, state.plant, r_tilde + load, key)
@@ -99,10 +99,10 @@ def step(
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
 ) -> tuple[LoopState, Any, jax.Array, Any]:
-    """One control step under a JAX policy with its memory (carry); otherwise as `advance`.
+    """One control step under a JAX policy with its memory (carry); otherwise like `advance`.
 
     Returns:
-        The state at t_(k+1), the memory, the reward, and what `treat` found.
+        The state at t_(k+1), the memory, the reward, and the result of `treat`.
     """
     memory, r_tilde = policy.act(policy_params, memory, r, state.y_seen, key_policy)
     state, reward, found = advance(plant, params, price, state, r, r_tilde, key, measure, treat, load)

@@ -34,7 +34,7 @@ RESET = 1  # folded into the key of a step that ends an episode
 
 @struct.dataclass
 class EnvParams:
-    """Everything that may be swept without recompiling."""
+    """Everything that can be swept without recompiling."""
 
     plant: Any
     sensor: SensorParams
@@ -45,9 +45,9 @@ class EnvState(NamedTuple):
     """State of one environment at t_k."""
 
     plant: Any
-    plant_params: Any  # drawn at reset; None where the plant draws none
+    plant_params: Any  # drawn at reset; None if the plant draws none
     goal: Any
-    memory: Memory  # of the outer loop, e_k integrated
+    memory: Memory  # of the outer loop, with e_k already integrated
     r: jax.Array  # reference r_k
     y: jax.Array  # true output y_k
     y_seen: jax.Array  # measured output
@@ -56,14 +56,14 @@ class EnvState(NamedTuple):
 
 @dataclass(frozen=True)
 class Environment:
-    """A plant, a goal generator and what the agent sees of them. Static and hashable."""
+    """A plant, a reference generator and the observer. Static and hashable."""
 
     plant: Plant
     observer: Observer
     goal: Goal
 
     def reset(self, key: chex.PRNGKey, params: EnvParams) -> tuple[jax.Array, EnvState]:
-        """A new episode: parameters, start and reference are drawn.
+        """Begin an episode: draw parameters, start and reference.
 
         Returns:
             obs (3 + 2H,) and the state.
@@ -78,10 +78,10 @@ class Environment:
         return obs, EnvState(state, drawn, goal, memory, r, loop.y, loop.y_seen, jnp.zeros((), jnp.int32))
 
     def _bounded(self, r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """An output that has diverged, NaN included, is held at the bounds, and ends the episode."""
+        """Clip an output that has diverged (NaN included) to the bounds; the flag ends the episode."""
         del r_tilde
         low, high = self.plant.divergence_bounds
-        terminated = ~((y >= low) & (y <= high))  # so that NaN counts as divergence
+        terminated = ~((y >= low) & (y <= high))  # in this form NaN counts as divergence
         return jnp.where(terminated, jnp.clip(jnp.nan_to_num(y, nan=high), low, high), y), terminated
 
     def step_env(
@@ -92,17 +92,17 @@ class Environment:
         Args:
             key: randomness of plant and sensor.
             state: at t_k.
-            action: r~_k, scalar, clipped to its bounds; in place of NaN r_k.
+            action: r~_k, scalar, clipped to its bounds; NaN is replaced by r_k.
             params: traced parameters.
 
         Returns:
-            obs, state, reward, terminated (y diverged), truncated (the episode's length is reached), and info with
-            `final_observation` (obs before any reset), `r` and `y` (the reference and measured output in it).
+            obs, state, reward, terminated (y diverged), truncated (the episode has its full length), and info with
+            `final_observation` (obs before any reset), `r` and `y` (its reference and measured output).
         """
         chex.assert_rank(action, 0)
         plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
         action = jnp.where(jnp.isnan(action), state.r, action)
-        # What the memory holds before the first step comes from the sensor; the reward is of the true y.
+        # Before the first step the memory holds a measured y; the reward needs the true one.
         before = jnp.where(state.k == 0, jnp.clip(state.y, *plant.r_tilde_bounds), state.memory.r_tilde_past[0])
         loop = LoopState(state.plant, state.y, state.y_seen, before)
         measure = partial(sensor.measure, params.sensor, key)
@@ -121,9 +121,9 @@ class Environment:
     def step(
         self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """One control step; where the episode ends, obs and state are those of a new one.
+        """One control step; when the episode ends, obs and state are those of a new one.
 
-        The observation that ended it is `info["final_observation"]`: bootstrap from it unless terminated.
+        The last observation of the old one is `info["final_observation"]`: bootstrap from it unless terminated.
         """
         obs, after, reward, terminated, truncated, info = self.step_env(key, state, action, params)
         done = terminated | truncated
@@ -138,10 +138,10 @@ class Environment:
 
 
 def _if_any(needed: jax.Array, function: Callable[..., Any], operands: tuple[Any, ...], otherwise: Any) -> Any:
-    """function(*operands) where it is needed (bool scalar); elsewhere that or `otherwise`, of the same structure.
+    """function(*operands) if `needed` (bool scalar), else `otherwise`, of the same structure.
 
-    Under vmap the function runs as soon as one lane needs it, and not at all if none does, where `cond` would become a
-    `select` and run it always. A reset is needed once in an episode, but costs more than a step.
+    Under vmap the function runs for all lanes if one needs it, so lanes that don't may get either value. `cond` would
+    become a `select` and always run it. A reset is needed once in an episode, but costs more than a step.
     """
 
     @custom_vmap
@@ -179,8 +179,8 @@ def make(
     Args:
         name: plant, see `jaxouter.plants.make`.
         history, integral_steps: of the observation, see `Observer.of`.
-        goal: reference generator; None: one set-point an episode, as in the paper.
-        drawn: numbers of the plant that are drawn at each reset, see `jaxouter.plants.randomised`.
+        goal: reference generator; None: one set-point per episode, as in the paper.
+        drawn: parameters to draw at each reset, see `jaxouter.plants.randomised`.
         **overrides: parameters of the plant.
     """
     plant, plant_params = make_plant(name, **overrides)

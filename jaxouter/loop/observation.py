@@ -1,7 +1,7 @@
-"""What the agent sees: present and past r, y, r~ and functions of them, nothing else (paper section II).
+"""What the agent sees: current and past r, y, r~ and functions of them, nothing else (paper section II).
 
-The same functions serve the environment, the policy and the replay, which stores signals and builds observations from
-windows of them: what is not in `Signals` cannot reach the agent or the critic.
+Environment, policy and replay use the same functions. The replay stores signals and builds observations from windows
+of them, so what is not in `Signals` cannot reach the agent or the critic.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 
 from jaxouter.plants import Plant
 
-HISTORY = 15  # past samples, where nothing says how many
+HISTORY = 15  # past samples by default
 
 
 class Memory(NamedTuple):
-    """What an outer loop remembers between two control steps."""
+    """Memory of the outer loop between two control steps."""
 
     y_past: jax.Array  # (H,), y_(k-1), y_(k-2), ...
     r_tilde_past: jax.Array  # (H,), r~_(k-1), r~_(k-2), ...
@@ -27,7 +27,7 @@ class Memory(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """One control step as the replay stores it; each (W,) in a window, oldest first."""
+    """One control step as stored in the replay; each (W,) in a window, oldest first."""
 
     r: jax.Array
     y: jax.Array
@@ -40,7 +40,7 @@ class Signals(NamedTuple):
 
 @dataclass(frozen=True)
 class Observer:
-    """Builds observations, scaled by fixed physical units. Static and hashable."""
+    """Builds observations with a fixed scaling. Static and hashable."""
 
     history: int
     """H, past samples of y and of r~."""
@@ -52,7 +52,12 @@ class Observer:
 
     @classmethod
     def of(cls, plant: Plant, history: int | None = None, integral_steps: float | None = None) -> Observer:
-        """The observer of a plant; None: the plant's history, or 15 where it declares none; a quarter of an episode.
+        """The observer of a plant.
+
+        Args:
+            plant: gives the scaling.
+            history: None: as the plant declares, or 15.
+            integral_steps: None: a quarter of an episode.
 
         Raises:
             ValueError: history below 1 or integral_steps below 1.
@@ -81,7 +86,7 @@ class Observer:
         return memory, self.features(memory, r, y)
 
     def record(self, memory: Memory, y: jax.Array, r_tilde: jax.Array) -> Memory:
-        """After r~_k is chosen: y_k and r~_k become past."""
+        """After r~_k is chosen: y_k and r~_k enter the past."""
         return memory._replace(
             y_past=jnp.concatenate([y[None], memory.y_past[:-1]]),
             r_tilde_past=jnp.concatenate([r_tilde[None], memory.r_tilde_past[:-1]]),
@@ -100,7 +105,7 @@ class Observer:
         """Memory at t_i (its error integrated) from a window that starts at least H steps before step i.
 
         Args:
-            window: Signals of (W,) consecutive steps of one environment; a reset may lie among those before i.
+            window: Signals of W consecutive steps of one environment; there may be a reset among those before i.
             i: index in the window, H <= i < W.
         """
         back = jnp.arange(1, self.history + 1)
@@ -115,7 +120,7 @@ class Observer:
         )
 
     def before_and_after(self, window: Signals, i: jax.Array | int, j: jax.Array | int) -> tuple[jax.Array, jax.Array]:
-        """Observation at t_i, and at t_(j+1) from what followed step j >= i (before any reset); each (3 + 2H,)."""
+        """Observations at t_i and at t_(j+1), j >= i, the latter before any reset; each (3 + 2H,)."""
         at_i = self.features(self.memory_at(window, i), window.r[i], window.y[i])
         memory = self.record(self.memory_at(window, j), window.y[j], window.r_tilde[j])
         return at_i, self.observe(memory, window.r_next[j], window.y_next[j])[1]

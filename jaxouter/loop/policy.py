@@ -13,17 +13,17 @@ from jaxouter.plants import Plant
 
 
 class Policy(Protocol):
-    """An outer loop: sees r and y, chooses r~. Pure and jit-able, unless `host` is True: then plain NumPy or Python.
+    """An outer loop: sees r and y, chooses r~. Pure and jittable JAX, or plain NumPy or Python if `host` is True.
 
-    A JAX policy must be hashable (a frozen dataclass); what is learned or tuned goes into `params`, a pytree.
+    A JAX policy must be hashable (a frozen dataclass). What is learned or tuned goes into `params`, a pytree.
 
-    A host policy gets NumPy scalars and no key: one that draws keeps a generator of its own in the carry. Where it
-    cannot decide it returns nan, or raises ArithmeticError or LinAlgError: that episode then counts as diverged.
+    A host policy gets NumPy scalars and no key; if it needs random numbers, its carry holds a generator. If it cannot
+    decide, it returns nan or raises ArithmeticError or LinAlgError: that episode then counts as diverged.
     """
 
     @property
     def host(self) -> bool:
-        """Whether it is plain NumPy or Python."""
+        """Whether it is plain NumPy or Python instead of JAX."""
         ...
 
     def init(self, params: Any, r0: Any, y0: Any) -> Any:
@@ -44,7 +44,7 @@ class AffineParams(NamedTuple):
 
 @dataclass(frozen=True)
 class Affine:
-    """r~ = offset + slope r, clipped: with slope 1 the inner loop alone, with 1 / gain the static prefilter."""
+    """r~ = offset + slope r, clipped. Slope 1 is the inner loop alone, slope 1 / gain the static prefilter."""
 
     r_tilde_bounds: tuple[float, float]
     host: bool = False

@@ -1,8 +1,8 @@
-"""References: families of whole trajectories, and goal generators that an environment asks step by step.
+"""References: families of whole trajectories, and generators that give an environment one reference per step.
 
-A family is a pure function `family(key, steps, low, high) -> r`, r of shape (steps,) within [low, high]. A goal
-generator is `init(key, y0) -> (state, r0)` and `step(state, y) -> (state, r)`: the next reference may depend on
-what the plant does (paper section II: 'a human operator that interacts with the observed state').
+A family is a pure function `family(key, steps, low, high) -> r`, r of shape (steps,) within [low, high]. A generator
+(`Goal`) has `init(key, y0) -> (state, r0)` and `step(state, y) -> (state, r)`: the next reference may depend on the
+output (paper section II: 'a human operator that interacts with the observed state').
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _time(steps: int) -> jax.Array:
 
 
 def constant(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
-    """One set-point from the start on."""
+    """One set-point throughout."""
     return jnp.full(steps, jax.random.uniform(key, (), float, low, high))
 
 
@@ -36,9 +36,10 @@ def telegraph(key: chex.PRNGKey, steps: int, low: float, high: float, redraw: ja
 
 
 def wander(key: chex.PRNGKey, steps: int, low: float, high: float, inertia: jax.Array | float) -> jax.Array:
-    """A smooth random course, (steps,), at each time uniform in [low, high].
+    """A smooth random trajectory, (steps,), whose value at each time is uniform in [low, high].
 
-    Gaussian noise behind two lags of time constant `inertia` (control steps), by its spectrum, squashed to the range.
+    Gaussian noise through two lags of time constant `inertia` (control steps), made from its spectrum and then squashed
+    to the range.
     """
     k = jnp.arange(steps // 2 + 1, dtype=float)
     pole = jnp.exp(-1.0 / inertia)
@@ -52,11 +53,12 @@ def wander(key: chex.PRNGKey, steps: int, low: float, high: float, inertia: jax.
 def redrawn(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
     """Reference of a training episode, (steps,): set-points in [low, high], redrawn at random times.
 
-    A fifth of the episodes keep one set-point. In a fifth it is redrawn, with a probability that is log-uniform from
-    one to twenty times an episode. In a fifth it is redrawn at each step near the one before: a random walk, reflected
-    at the ends of the range, whose steps have a standard deviation log-uniform from 0.25 to 5 % of the range. In the
-    rest it wanders smoothly over a part of the range, with a time constant log-uniform from a fiftieth to a fifth of an
-    episode.
+    - A fifth of the episodes keep one set-point.
+    - A fifth redraw it one to twenty times per episode on average, log-uniform.
+    - A fifth are random walks, reflected at the ends of the range; the standard deviation of a step is log-uniform from
+      0.25 to 5 % of the range.
+    - The rest wander smoothly over a part of the range, with a time constant log-uniform from a fiftieth to a fifth of
+      an episode.
     """
     key_kind, key_share, key_part, key_run = jax.random.split(key, 4)
     share, width, place = jax.random.uniform(key_share, (3,), float)
@@ -84,7 +86,7 @@ def ramps(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
 
 
 def sines(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
-    """A sine about the middle: a quarter to all of the range, 3 to 12 periods."""
+    """A sine about the middle of the range: a quarter to all of the range, 3 to 12 periods."""
     amplitude, cycles = jax.random.uniform(key, (2,), float, jnp.array([0.25, 3.0]), jnp.array([1.0, 12.0]))
     wave = jnp.sin(2 * jnp.pi * cycles * _time(steps))
     return (low + high) / 2 + amplitude * (high - low) / 2 * wave
@@ -94,14 +96,14 @@ def doublets(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Arra
     """Middle, up, down, middle: a quarter to all of the range, each pulse an eighth to a quarter of the time."""
     amplitude, width = jax.random.uniform(key, (2,), float, jnp.array([0.25, 0.125]), jnp.array([1.0, 0.25]))
     sign = jax.random.rademacher(jax.random.fold_in(key, 1), (), float)
-    since = jnp.arange(steps, dtype=float) - steps / 8  # without rounding: the same first step on every processor
+    since = jnp.arange(steps, dtype=float) - steps / 8  # not rounded: the same first step on every processor
     phase = since / (width * steps)  # pulses on [0, 1) and [1, 2)
     pulse = jnp.where((phase >= 0) & (phase < 1), 1.0, 0.0) - jnp.where((phase >= 1) & (phase < 2), 1.0, 0.0)
     return (low + high) / 2 + sign * amplitude * (high - low) / 2 * pulse
 
 
 def days(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
-    """Night set-back: 16 steps warm, 8 steps cool, of 24 a day, starting at a random hour."""
+    """Night set-back: 16 warm and 8 cool steps per day of 24, starting at a random hour."""
     key_levels, key_hour = jax.random.split(key)
     share = jax.random.uniform(key_levels, (2,), float)
     warm, cool = (low + high) / 2 + (high - low) / 2 * share * jnp.array([1.0, -1.0])
@@ -120,14 +122,14 @@ FAMILIES: dict[str, Callable[[chex.PRNGKey, int, float, float], jax.Array]] = {
 
 
 class Goal(Protocol):
-    """A goal generator."""
+    """A reference generator."""
 
     def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[Any, jax.Array]:
         """State and the first reference."""
         ...
 
     def step(self, state: Any, y: jax.Array) -> tuple[Any, jax.Array]:
-        """State and the next reference, after the plant gave y."""
+        """State and the next reference, given the plant's new output y."""
         ...
 
 
@@ -140,7 +142,7 @@ class SetPointState(NamedTuple):
 
 @dataclass(frozen=True)
 class SetPoint:
-    """A set-point uniform in [low, high], redrawn at each step with a probability (0: one an episode, the paper)."""
+    """A set-point uniform in [low, high], redrawn at each step with probability `redraw` (the paper's: 0, never)."""
 
     low: float
     high: float
@@ -154,7 +156,7 @@ class SetPoint:
         return SetPointState(key, r), r
 
     def step(self, state: SetPointState, y: jax.Array) -> tuple[SetPointState, jax.Array]:
-        """The same set-point, or with probability `redraw` another."""
+        """The same set-point, or another with probability `redraw`."""
         del y
         if self.redraw == 0.0:
             return state, state.r
@@ -166,7 +168,7 @@ class SetPoint:
 
 @dataclass(frozen=True)
 class Reaimed:
-    """A human who re-aims: a new set-point in [low, high] as soon as y is within `tolerance` of the present one."""
+    """A human who re-aims: a new set-point in [low, high] as soon as y is within `tolerance` of the current one."""
 
     low: float
     high: float
@@ -177,7 +179,7 @@ class Reaimed:
         return SetPoint(self.low, self.high).init(key, y0)
 
     def step(self, state: SetPointState, y: jax.Array) -> tuple[SetPointState, jax.Array]:
-        """The same set-point until y is near it."""
+        """The same set-point until y reaches it."""
         key, draw = jax.random.split(state.key)
         other = jax.random.uniform(draw, (), float, self.low, self.high)
         r = jnp.where(jnp.abs(state.r - y) < self.tolerance, other, state.r)

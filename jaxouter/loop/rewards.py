@@ -1,4 +1,4 @@
-"""The reward R = G(e) + H(r~) + B(y), from small functions of scalars (paper eq. 1)."""
+"""The reward R = G(e) + H(r~) + B(y), composed of scalar functions (paper eq. 1)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from jaxouter.plants import Plant
 
 @struct.dataclass
 class RewardParams:
-    """Constants of the reward, all traced. A limit or threshold that a plant lacks is infinite."""
+    """Constants of the reward, all traced. A limit or threshold that the plant does not have is infinite."""
 
     alpha_g: jax.Array  # price of the error
     beta_h: jax.Array  # price of a move of r~
-    rho_h: jax.Array  # moves of r~ from this size on are charged
+    rho_h: jax.Array  # smallest move of r~ that is charged
     beta_b: jax.Array  # price of a move of y
-    rho_b: jax.Array  # moves of y from this size on are charged
+    rho_b: jax.Array  # smallest move of y that is charged
     delta_b: jax.Array  # price of leaving the limits
     output_limit: jax.Array  # on |y|
     rate_limit: jax.Array  # on a move of y
@@ -25,7 +25,7 @@ class RewardParams:
 
 
 def params(plant: Plant, divergence: float = -50.0) -> RewardParams:
-    """The paper's constants, with the thresholds and limits that the plant declares; divergence in error scales."""
+    """The paper's constants, with the plant's declared thresholds and limits; `divergence` in error scales."""
 
     def declared(value: float | None) -> jax.Array:
         return jnp.asarray(jnp.inf if value is None else value, float)
@@ -49,12 +49,12 @@ def tracking(e: jax.Array, alpha: jax.Array) -> jax.Array:
 
 
 def moves(delta: jax.Array, beta: jax.Array, rho: jax.Array) -> jax.Array:
-    """H, and the first part of B: a move delta >= 0, priced from rho (included) on."""
+    """H, and the first part of B: a move delta >= 0, charged if it is at least rho."""
     return jnp.where(delta >= rho, -beta * delta, 0.0)
 
 
 def excess(value: jax.Array, limit: jax.Array, delta: jax.Array) -> jax.Array:
-    """The second part of B: what `value` has above `limit`."""
+    """The second part of B: the excess of `value` over `limit`."""
     return -delta * jnp.maximum(0.0, value - limit)
 
 
@@ -66,8 +66,8 @@ def reward(
     Args:
         p: constants.
         r: reference at t_k.
-        y, y_before: output at t_(k+1) and t_k.
-        r_tilde, r_tilde_before: modified reference at t_k and t_(k-1).
+        y, y_before: outputs at t_(k+1) and t_k.
+        r_tilde, r_tilde_before: modified references at t_k and t_(k-1).
 
     Source: paper eq. 1 and 7, B of sections III and IV.
     """

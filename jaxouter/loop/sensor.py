@@ -1,4 +1,4 @@
-"""The sensor between y and whoever looks at it. Metrics and rewards use the true y."""
+"""The sensor that measures y. Metrics and rewards use the true y."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class SensorParams:
 
     noise: jax.Array  # standard deviation, in the unit of y
     bias: jax.Array  # in the unit of y
-    missing: jax.Array  # probability that a sample is lost; the last one then stands
+    missing: jax.Array  # probability that a sample is lost; the last one is then repeated
 
 
 def params(noise: float = 0.0, bias: float = 0.0, missing: float = 0.0) -> SensorParams:
@@ -31,13 +31,13 @@ def params(noise: float = 0.0, bias: float = 0.0, missing: float = 0.0) -> Senso
 
 
 def measure(p: SensorParams, key: chex.PRNGKey, y: jax.Array, last: jax.Array) -> jax.Array:
-    """What is seen of y (scalar), when `last` was seen before; the plant's noise may have the same key."""
+    """The measured y (scalar); a lost sample repeats `last`. The key may be the one of the plant's noise."""
 
     def disturbed(key: chex.PRNGKey) -> jax.Array:
-        # One draw: each one more costs time to compile.
+        # A single draw, as each one takes time to compile.
         noise, chance = jax.random.normal(jax.random.fold_in(key, SENSOR), (2,), y.dtype)
         lost = jax.scipy.special.ndtr(chance) < p.missing
         return jnp.where(lost, last, y + p.bias + p.noise * noise)
 
-    # Numbers are drawn only where they matter, as long as the sensor is the same for all.
+    # Nothing is drawn for a sensor without noise or losses (unless it is vmapped: then `cond` runs both branches).
     return jax.lax.cond((p.noise > 0) | (p.missing > 0), disturbed, lambda key: y + p.bias, key)

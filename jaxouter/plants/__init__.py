@@ -1,4 +1,4 @@
-"""The plants: physics only, nothing of learning. A new plant is one file and one line in `REGISTRY`."""
+"""Plants: physics only, no learning. A new plant is one file and one line in `REGISTRY`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from jaxouter.plants.base import Plant, outputs
 __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate"]
 
 Ranges = tuple[tuple[str, float, float], ...]
-"""Names of a plant's numbers, and between what each is drawn."""
+"""(name, low, high) of each parameter that is drawn."""
 
 versions.warn()
-SHORT = 4  # elements of a vector that have names
+SHORT = 4  # longest vector whose elements have names
 REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
 
 
@@ -28,7 +28,7 @@ def resolve(name: str) -> Callable[..., tuple[Plant, Any]]:
     """The `make` function of the plant called `name`.
 
     Raises:
-        ValueError: there is no such plant; lists those that exist.
+        ValueError: there is no such plant; lists the plants.
     """
     if name not in REGISTRY:
         raise ValueError(f"there is no plant {name!r}; the plants are: {', '.join(REGISTRY)}")
@@ -41,11 +41,11 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
     For example: `plant, params = make("pitch", tau=0.5, d1=0.57)`.
 
     Args:
-        name: `pitch` or `heaters` (or whatever stands in `REGISTRY`).
+        name: `pitch`, `heaters` or another key of `REGISTRY`.
         **overrides: keyword arguments of the plant's own `make`, such as `jaxouter.plants.pitch.make`.
 
     Raises:
-        ValueError: unknown plant or override (lists what exists), or a value that does not fit.
+        ValueError: unknown plant or override (lists the known ones), or a wrong value.
     """
     maker = resolve(name)
     known = list(inspect.signature(maker).parameters)
@@ -56,7 +56,7 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
 
 
 def numbers(params: Any) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """The numbers among a plant's parameters, elements of short vectors too: name -> which leaf, and where in it."""
+    """Scalar parameters of a plant, including elements of short vectors: name -> (leaf, index in it)."""
     found: dict[str, tuple[int, tuple[int, ...]]] = {}
     for i, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(params)):
         name = getattr(path[-1], "name", "")
@@ -68,19 +68,19 @@ def numbers(params: Any) -> dict[str, tuple[int, tuple[int, ...]]]:
 
 
 def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
-    """The plant with some of its numbers drawn anew for each episode, uniformly (domain randomisation).
+    """The plant with some parameters drawn uniformly for each episode (domain randomisation).
 
     For example: `plant, params = randomised(*make("pitch"), (("gain", 0.8, 1.2), ("d1", 0.0, 0.7)))`.
 
     Args:
         plant, params: as `make` returns them.
-        ranges: numbers among the parameters, such as `gain` or `W[1]`, each with its least and greatest value.
+        ranges: parameters such as `gain` or `W[1]`, each with its least and greatest value.
 
     Returns:
-        The plant, which now has a `draw`, and parameters in which what is not drawn is as it was.
+        The plant, now with a `draw`, and its parameters; those not drawn are unchanged.
 
     Raises:
-        ValueError: a name is not one of the plant's numbers (lists those), or a range is none.
+        ValueError: a name is not a scalar parameter of the plant (lists those), or a range is not one.
     """
     if plant.identified:
         raise ValueError(f"plant {plant.name!r} has nothing to draw by a range; its models are drawn, see log:FILE")
@@ -96,7 +96,7 @@ def randomised(plant: Plant, params: Any, ranges: Ranges) -> tuple[Plant, Any]:
 
 @cache
 def _drawing(plant: Plant, drawn: tuple[tuple[int, tuple[int, ...], float, float], ...]) -> Plant:
-    """The plant that draws these elements of these leaves; the same one each time, so that it is compiled once."""
+    """The plant that draws these elements of these leaves; cached, so that it is compiled once."""
 
     def draw(key: chex.PRNGKey, params: Any) -> Any:
         leaves, structure = jax.tree.flatten(params)
@@ -119,7 +119,7 @@ def simulate(plant: Plant, params: Any, r_tilde: Any, key: chex.PRNGKey, state: 
         plant, params: as `make` returns them.
         r_tilde: (T,), in the plant's unit, each held for one control step.
         key: randomness of start and noise.
-        state: where to begin; None: from rest (heaters: from the given temperatures).
+        state: initial state; None: at rest (heaters: the given temperatures).
 
     Returns:
         y (T,), the output after each control step.

@@ -1,7 +1,7 @@
-"""A plant told by numbers alone: a linear model, and an ensemble of others that it may as well be.
+"""A linear plant: a nominal ARX model, and an ensemble of models for domain randomisation.
 
-y_(k+1) = sum_i a_i y_(k-i) + sum_i b_i r~_(k-i) + c + e, i from 0, where a dead time is zeros at the beginning of b.
-Episodes of training draw a member of the ensemble each; undrawn, the parameters are the nominal ones.
+y_(k+1) = sum_i a_i y_(k-i) + sum_i b_i r~_(k-i) + c + e, i from 0; a dead time is zeros at the beginning of b.
+Each training episode draws a member of the ensemble; otherwise the nominal model is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxouter.plants.base import Plant
 
 
 class Model(NamedTuple):
-    """One model, of JAX or NumPy numbers; each with a leading axis in an ensemble."""
+    """One model, in JAX or NumPy numbers; an ensemble has a leading axis on each field."""
 
     a: Any  # (n,)
     b: Any  # (m,)
@@ -29,13 +29,13 @@ class Model(NamedTuple):
 class ARXParams(NamedTuple):
     """Parameters of the plant; every array is traced."""
 
-    model: Model  # that acts
-    ensemble: Model  # each (members, ...), of which `draw` takes one as the model that acts
-    held: jax.Array  # (2,), r~ that hold the ends of the range of set-points by the nominal model
+    model: Model  # the model in use
+    ensemble: Model  # each (members, ...); `draw` takes one as the model in use
+    held: jax.Array  # (2,), r~ under which the nominal model stays at the ends of the set-point range
 
 
 class ARXState(NamedTuple):
-    """What came last, the newest first."""
+    """Past samples, newest first."""
 
     y: jax.Array  # (n,)
     r_tilde: jax.Array  # (m,)
@@ -45,8 +45,8 @@ def make(nominal: Model, members: Sequence[Model], **declared: Any) -> tuple[Pla
     """The plant of these models and its parameters.
 
     Args:
-        nominal: the model of the parameters that are not drawn.
-        members: what may be drawn; each of the shapes of the nominal one.
+        nominal: the model in use unless one is drawn.
+        members: models that may be drawn, with the shapes of the nominal one.
         **declared: fields of `Plant`.
     """
     plant = Plant(
@@ -60,7 +60,7 @@ def make(nominal: Model, members: Sequence[Model], **declared: Any) -> tuple[Pla
 
 
 def _rest(params: ARXParams, r_tilde: jax.Array) -> ARXState:
-    """Where the model stays under this r~."""
+    """The steady state under this r~."""
     p = params.model
     y = (jnp.sum(p.b) * r_tilde + p.c) / (1.0 - jnp.sum(p.a))
     return ARXState(jnp.full(p.a.shape, y), jnp.full(p.b.shape, r_tilde))
@@ -73,13 +73,13 @@ def init(key: chex.PRNGKey, params: ARXParams) -> ARXState:
 
 
 def start(key: chex.PRNGKey, params: ARXParams) -> ARXState:
-    """A training start: at rest at any of the set-points."""
+    """A training start: at rest at a random set-point."""
     low, high = params.held
     return _rest(params, low + (high - low) * jax.random.uniform(key, (), low.dtype))
 
 
 def draw(key: chex.PRNGKey, params: ARXParams) -> ARXParams:
-    """One of the ensemble acts."""
+    """A random member of the ensemble becomes the model in use."""
     member = jax.random.randint(key, (), 0, params.ensemble.c.shape[0])
     return params._replace(model=jax.tree.map(lambda leaf: leaf[member], params.ensemble))
 
@@ -91,7 +91,7 @@ def output(params: ARXParams, state: ARXState) -> jax.Array:
 
 
 def step(params: ARXParams, state: ARXState, r_tilde: jax.Array, key: chex.PRNGKey) -> ARXState:
-    """One control step, with e drawn."""
+    """One control step, with random e."""
     p = params.model
     r_tilde_past = jnp.concatenate([r_tilde[None], state.r_tilde[:-1]])
     e = p.sigma * jax.random.normal(key, (), p.c.dtype)

@@ -1,4 +1,4 @@
-"""What a plant is: three pure functions on one unbatched plant, and a declaration from which the rest derives."""
+"""The plant interface: three pure functions on one unbatched plant, and a declaration of its numbers."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 
 from jaxouter.plants import declaration
 
-RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options of what takes longer to compile than to run
-MOVE = 0.03  # of the range of r~, as pitch's 3.5 of 120
+RUN_ONCE = {"xla_backend_optimization_level": 0}  # compiler options for code that compiles longer than it runs
+MOVE = 0.03  # default move threshold as share of the range of r~, like pitch's 3.5 of 120
 
 
 def float_leaves(params: Any, state: Any) -> list[jax.Array]:
@@ -38,8 +38,8 @@ def _is_float(leaf: jax.Array) -> bool:
 class Plant:
     """A plant with its inner loop, seen from outside: r~ goes in, y comes out.
 
-    The functions are pure and work on one unbatched plant; callers vmap. Parameters and state are pytrees, parameters
-    are always traced. Rewards, observation scaling and scenario families derive from the declared numbers.
+    The functions are pure and work on one unbatched plant; callers vmap. Parameters and state are pytrees; parameters
+    are always traced. Rewards, observation scaling and evaluation families derive from the declared numbers.
     """
 
     name: str
@@ -69,45 +69,46 @@ class Plant:
     """|y_(k+1) - y_k| must not exceed this (the paper's L on heaters)."""
     move_threshold: float | None = None
     """Moves of r~ and of y of at least this size are charged (the paper's rho_h and rho_b); default: 3 % of the range
-    of r~, inf: none. Where moves cost nothing, an r~ that goes to and fro between its bounds may be what is learned."""
+    of r~, inf: none. If moves are free, the learned r~ may jump to and fro between its bounds."""
     error_scale: float = 0.0
-    """Error that counts as one for the learner, in `y_unit`: costs, the price of divergence and rounding are told in
-    terms of it, so that no result depends on the unit; 0: a twentieth of the set-point range."""
+    """Error that counts as 1 for the learner, in `y_unit`. Costs, the price of divergence and tolerances are relative
+    to it, so that no result depends on the unit; 0: a twentieth of the set-point range."""
     history: int | None = None
-    """Past samples of y and r~ in the observation; None: training chooses them by the dead time that it identifies."""
+    """Past samples of y and r~ in the observation; None: training chooses by the dead time that it identifies."""
     families: tuple[str, ...] = ("steps", "staircase", "ramps")
-    """Reference families of the evaluation, by the names of `jaxouter.loop.references`."""
+    """Reference families of the evaluation, by name in `jaxouter.loop.references`."""
     family_steps: int = 600
     """Length of a family member in control steps (`steps`: one episode)."""
 
     differentiable: bool = True
-    """Whether its functions are; `oracle` and the stability analysis need it."""
+    """Whether its functions are differentiable; `oracle` and the stability analysis need it."""
     affine: bool = False
     """Whether y is affine in r~ with additive noise along any episode; `clairvoyant` needs it."""
     start: Callable[[chex.PRNGKey, Any], Any] | None = None
-    """`start(key, params) -> state`: a draw from the distribution of starts in training; None: `init`."""
+    """`start(key, params) -> state`: a random start of a training episode; None: `init`."""
     draw: Callable[[chex.PRNGKey, Any], Any] | None = None
     """`draw(key, params) -> params`: parameters of a training episode (domain randomisation); None: the given ones."""
     identified: bool = False
-    """Its equations are a model of a record, and not the plant's own: a learner may know them, as they cost nothing."""
+    """Whether it is a model identified from a record, not the plant itself. A learner may then use its equations, as
+    that costs no experiments on the plant."""
     reuse: Callable[[Any, Any], Any] = lambda old, fresh: fresh
-    """`reuse(old, fresh) -> state`: the fresh state, with what of the old one need not be cleared at a reset (the
-    contents of delay lines), so that it isn't copied."""
+    """`reuse(old, fresh) -> state`: the fresh state, but with those arrays of the old one that need not be cleared at a
+    reset (delay lines). It saves a copy."""
     members: Callable[[Any, Any], jax.Array] | None = None
-    """`members(params, state) -> (n,)`: the single outputs of which y is a weighted mean; None: y is all there is."""
+    """`members(params, state) -> (n,)`: the individual outputs of which y is a weighted mean; None: there are none."""
 
     variables: Callable[[Any, Any], Any] = float_leaves
-    """`variables(params, state) -> pytree of floats`: what evolves, in time-invariant form, so delay lines from the
-    oldest to the newest sample, and without clocks, keys and constants of the episode."""
+    """`variables(params, state) -> pytree of floats`: the state variables in time-invariant form: delay lines from the
+    oldest to the newest sample; no clocks, keys or constants of the episode."""
     settled: Callable[[Any, Any, Any], Any] = with_float_leaves
-    """`settled(params, state, variables) -> state`, the inverse of `variables`: the state long after the start (t to
-    infinity) with these variables and the constants of `state`. Its step must not depend on clocks any more."""
+    """`settled(params, state, variables) -> state`, the inverse of `variables`: the state with these variables and the
+    constants of `state`, long after the start (t to infinity), when no step depends on a clock any more."""
     noise_free: Callable[[Any], Any] = lambda params: params
     """`noise_free(params) -> params`: the same plant without noise."""
     smallest: Callable[[Any], Any] = lambda params: params
-    """`smallest(params) -> params`: the same plant, of given (not traced) numbers, with no more state than it needs."""
+    """`smallest(params) -> params`: the same plant with the smallest state it needs; params are not traced."""
     widened: Callable[[Any, Mapping[str, tuple[float, float]]], Any] = lambda params, ranges: params
-    """`widened(params, ranges) -> params`: the same plant, so made that its numbers may lie in these ranges."""
+    """`widened(params, ranges) -> params`: the same plant, able to take any parameters in these ranges."""
 
     def __post_init__(self) -> None:
         self._take("r_tilde_bounds", "setpoint_range")
@@ -129,7 +130,7 @@ class Plant:
             raise ValueError(f"plant {self.name!r}: variables and settled are inverse; declare both or neither")
 
     def _take(self, *fields: str) -> None:
-        """Each of these fields as it is meant."""
+        """Check and normalise these fields."""
         for field in fields:
             value = declaration.checked(declaration.PLANT[field], f"plant {self.name!r}: {field}", getattr(self, field))
             object.__setattr__(self, field, value)
@@ -140,7 +141,7 @@ class Plant:
 
 
 def parameters(params: Any, change: tuple[jax.Array, Any] | None, k: jax.Array) -> Any:
-    """The plant's parameters at step k, when from step `change[0]` on they are `change[1]`."""
+    """The plant's parameters at step k; from step `change[0]` on they are `change[1]`."""
     if change is None:
         return params
     at, after = change

@@ -1,6 +1,7 @@
-"""One instance of an FMU for co-simulation, in this process or in one of its own.
+"""One instance of an FMU for co-simulation, in this process or in a separate one.
 
-It imports nothing of jaxouter, for it is also the program of those processes: a line in (`reset`, or r~), a line out.
+This module imports nothing from jaxouter, as it is also the program of the separate processes: one line in (`reset`,
+or r~), one line out.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-SAID = 3  # messages of an FMU that are kept
-DISCARD = 2  # status from which on a message tells of a failure; also of what a step gives that is none
+MESSAGES = 3  # newest messages of an FMU that are kept
+DISCARD = 2  # fmi2Discard: messages of this status or above report a failure; a step may return it to end
 TERMINATED = 3  # fmi2StatusKind
 
 
 class FmuError(Exception):
-    """An FMU did not do what it was asked for: what failed, and what the FMU said of it."""
+    """An FMU failed: the error, and the messages the FMU logged."""
 
 
 class Setup(NamedTuple):
-    """How an FMU is run; plain values."""
+    """How to run an FMU; plain values."""
 
-    folder: str  # where it is extracted
-    given: str  # variable that is r~
-    seen: str  # variable that is y
-    start: float  # time at which an episode begins
+    folder: str  # of the extracted FMU
+    given: str  # name of the variable for r~
+    seen: str  # name of the variable for y
+    start: float  # time at the start of an episode
     step: float  # communication step
-    anew: bool = False  # instantiate for each episode, as it can't be reset
+    anew: bool = False  # make a new instance for each episode, as it can't be reset
 
 
 @lru_cache(maxsize=4)
@@ -45,24 +46,24 @@ def _described(folder: str) -> Any:
     return read_model_description(folder, validate=False)
 
 
-_SAID: deque[str] = deque(maxlen=SAID)
+_MESSAGES: deque[str] = deque(maxlen=MESSAGES)
 
 
 class _Newest:
-    """FMPy lets all instances talk through the callbacks of the newest, which must outlive it."""
+    """FMPy routes the messages of all instances to the callbacks of the newest, so these must outlive it."""
 
     callbacks: Any = None
 
 
-def _log(*said: Any) -> None:
-    """Logger of FMI 2 and of FMI 3, whose last three arguments are status, category and message."""
-    status, _, message = said[-3:]
+def _log(*arguments: Any) -> None:
+    """Logger for FMI 2 and FMI 3; the last three arguments are status, category and message."""
+    status, _, message = arguments[-3:]
     if status >= DISCARD and message:
-        _SAID.append(message.decode("utf-8", "replace").strip())
+        _MESSAGES.append(message.decode("utf-8", "replace").strip())
 
 
 class Instance:
-    """An FMU between two of its variables; nan from where it ends the episode by itself."""
+    """An FMU from one input to one output; y is nan after the FMU has ended the episode by itself."""
 
     def __init__(self, setup: Setup) -> None:
         description = _described(setup.folder)
@@ -76,29 +77,29 @@ class Instance:
 
     def reset(self, seed: int) -> float:
         """Begin an episode; raises FmuError."""
-        del seed  # an FMU draws nothing
-        return self._heard(self._reset)
+        del seed  # an FMU has no random numbers
+        return self._with_messages(self._reset)
 
     def step(self, r_tilde: float) -> float:
         """One communication step; raises FmuError."""
-        return math.nan if self.ended else self._heard(lambda: self._step(r_tilde))
+        return math.nan if self.ended else self._with_messages(lambda: self._step(r_tilde))
 
     def free(self) -> None:
-        """Let the instance go."""
+        """Free the instance."""
         fmu, self._fmu, self._begun = self._fmu, None, False
         if fmu is not None:
-            with suppress(Exception):  # one that has failed need not end well
+            with suppress(Exception):  # a failed FMU may not terminate cleanly
                 fmu.terminate()
             with suppress(Exception):
                 fmu.freeInstance()
 
-    def _heard(self, act: Any) -> float:
-        """What `act` gives; what it raises comes with what the FMU said."""
-        _SAID.clear()
+    def _with_messages(self, act: Any) -> float:
+        """The result of `act`; its errors are raised with the FMU's messages."""
+        _MESSAGES.clear()
         try:
             return act()
         except Exception as error:
-            text = " ".join([str(error).rstrip("."), *(f"- the FMU: {message}" for message in _SAID)])
+            text = " ".join([str(error).rstrip("."), *(f"- the FMU: {message}" for message in _MESSAGES)])
             raise FmuError(text) from error
 
     def _reset(self) -> float:
@@ -129,7 +130,7 @@ class Instance:
         return math.nan if self.ended else self._y()
 
     def _ends(self) -> bool:
-        """Do the step; whether the FMU wants to end."""
+        """Do one step; whether the FMU asks to end the simulation."""
         at = self._setup.start + self._done * self._setup.step
         if self._three:
             return bool(self._fmu.doStep(at, self._setup.step)[1])
@@ -139,7 +140,7 @@ class Instance:
 
         try:
             self._fmu.doStep(at, self._setup.step)
-        except FMICallException as error:  # FMI 2 has no other way to say so
+        except FMICallException as error:  # the only way an FMI 2 FMU can ask to end
             ends = c_int(0)
             if error.status == DISCARD:
                 with suppress(Exception):
@@ -154,13 +155,13 @@ class Instance:
 
 
 class Apart:
-    """An FMU in a process of its own, for one that can be instantiated once in a process."""
+    """An FMU in a separate process, for FMUs that can be instantiated only once per process."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._process: subprocess.Popen[str] | None = None
         self._end: Callable[[], Any] = lambda: None
-        self._each = False  # a process for each episode
+        self._each = False  # a new process for each episode
         self.ended: str | None = None
 
     def reset(self, seed: int) -> float:
@@ -172,11 +173,11 @@ class Apart:
             except FmuError:
                 self._each = True
         self.free()
-        # -P: modules beside this file are none of the program's.
+        # -P: keep the modules next to this file off the program's path.
         program = [sys.executable, "-P", __file__, json.dumps(self._setup)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(program, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
-        self._end = weakref.finalize(self, _killed, self._process)  # also as the interpreter ends
+        self._end = weakref.finalize(self, _killed, self._process)  # runs at interpreter exit too
         return self._ask("reset")
 
     def step(self, r_tilde: float) -> float:
@@ -193,7 +194,7 @@ class Apart:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         line = ""
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the process has ended
             self._process.stdin.write(what + "\n")
             self._process.stdin.flush()
             line = self._process.stdout.readline()
@@ -212,9 +213,9 @@ def _killed(process: subprocess.Popen[str]) -> None:
 
 def main() -> None:
     """The program: one instance, until its input ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what the FMU prints is no answer
+    os.dup2(2, 1)  # keep what the FMU prints out of the answers
     instance = Instance(Setup(*json.loads(sys.argv[1])))
     for line in sys.stdin:
         y, error = math.nan, None

@@ -1,6 +1,6 @@
-"""What may stand in the fields of a declaration: each value as it is meant, or refused by the field's name.
+"""Checks on the fields of a plant's declaration: each value is normalised, or refused with the field's name.
 
-A NumPy scalar or an array without dimensions is a number, a list a tuple, 120.0 the count 120.
+A NumPy scalar or 0-dimensional array becomes a number, a list a tuple, 120.0 the count 120.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ FAMILIES = ("steps", "staircase", "ramps", "sines", "doublets", "days")  # of `j
 
 
 class Kind(NamedTuple):
-    """Values that a field may have."""
+    """A kind of value that a field may have."""
 
     allowed: str
     of: Callable[[Any], Any]
-    """The value as it is meant; raises TypeError or ValueError where it is none."""
+    """Normalises a value; raises TypeError or ValueError if it is not of this kind."""
     function: bool = False
 
 
 def number(value: Any) -> float:
-    """A number as a float, in the digits that it shows: np.float32(0.02) is 0.02.
+    """A number as a float with the digits it prints: np.float32(0.02) gives 0.02.
 
     Raises:
-        TypeError: it is none; neither is a bool or a text.
+        TypeError: it is not a number; bools and strings are not.
     """
     array = None if isinstance(value, str | bytes | list | tuple) else np.asarray(value)
     if array is None or array.ndim or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
@@ -38,7 +38,7 @@ def number(value: Any) -> float:
 
 
 def plain(value: Any) -> Any:
-    """A value of a configuration, with Python's numbers in place of arrays without dimensions, and tuples of lists."""
+    """A configuration value with Python numbers instead of 0-dimensional arrays, and tuples instead of lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.replace(value, **{name: plain(part) for name, part in vars(value).items()})
     if isinstance(value, tuple | list):
@@ -99,7 +99,7 @@ def _families(value: Any) -> tuple[str, ...]:
 
 
 def _or_none(kind: Kind) -> Kind:
-    """The same, or None."""
+    """The same kind, or None."""
     return Kind(f"{kind.allowed}, or None", lambda value: None if value is None else kind.of(value), kind.function)
 
 
@@ -147,15 +147,15 @@ PLANT: Mapping[str, Kind] = {
 
 
 def checked(kind: Kind, what: str, value: Any) -> Any:
-    """The value as it is meant.
+    """The normalised value.
 
     Args:
         kind: what is allowed.
-        what: name of the field, for people.
-        value: what was given.
+        what: the field, as the message names it.
+        value: as given.
 
     Raises:
-        ValueError: it is not allowed; names the field, the value, and what is.
+        ValueError: it is not allowed; names the field, the value, and what is allowed.
     """
     try:
         return kind.of(value)
@@ -164,6 +164,6 @@ def checked(kind: Kind, what: str, value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """A value in a message: not longer than a line."""
+    """A value as text for a message, at most one line."""
     text = repr(value).partition("\n")[0]
     return text if len(text) <= 100 else text[:97] + "..."

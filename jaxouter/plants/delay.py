@@ -1,9 +1,9 @@
 """Delay lines: ring buffers of scalar samples, read at real-valued lags.
 
-A line of length L holds the last L samples of a signal; sample number m lies in row m mod L, m = 0 at the start of the
-episode. Before sample 0 every line is zero, whatever the rows hold: a line need not be cleared to be reset.
+A line of length L holds the last L samples of a signal; sample m is in row m mod L, m = 0 at the start of the episode.
+Reads before sample 0 give zero, whatever the rows hold, so a line need not be cleared at a reset.
 
-Where n samples are written at once, the line ends with a mirror of its first n rows, so that n + 1 consecutive samples
+If n samples are written at once, the line ends with a mirror of its first n rows, so that n + 1 consecutive samples
 are one slice. Lines that are written and read in blocks may have trailing axes, and so may their lags.
 """
 
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 
 def length(max_delay: float, sample_time: float) -> int:
-    """Rows a line needs to serve delays up to `max_delay` (same unit as `sample_time`)."""
+    """Rows a line needs for delays up to `max_delay` (same unit as `sample_time`)."""
     return round(max_delay / sample_time) + 4
 
 
@@ -36,42 +36,42 @@ def write_block(lines: jax.Array, block: jax.Array, samples: jax.Array) -> jax.A
     n = samples.shape[1]
     position = block * n % (lines.shape[1] - n)
     lines = jax.lax.dynamic_update_slice_in_dim(lines, samples, position, 1)
-    mirror = jnp.where(position == 0, lines.shape[1] - n, position)  # the same place again: no branch
+    mirror = jnp.where(position == 0, lines.shape[1] - n, position)  # or write the same place again, without a branch
     return jax.lax.dynamic_update_slice_in_dim(lines, samples, mirror, 1)
 
 
 def _rows(line: jax.Array, start: jax.Array, n: int) -> jax.Array:
-    """Read n rows of `line` (L, ...) from `start` (scalar, or of its trailing axes) on; (n, ...)."""
+    """Read n rows of `line` (L, ...) from row `start` on (scalar, or one per entry of the trailing axes); (n, ...)."""
     if start.ndim == 0:
         return jax.lax.dynamic_slice_in_dim(line, start, n)
     lanes = jnp.arange(start.size, dtype=start.dtype).reshape(1, *start.shape)
     place = (start[None] + _column(start, n, line.ndim)) * start.size + lanes
-    return line.reshape(-1).at[place].get(mode="promise_in_bounds")  # one index an entry: much faster on a CPU than two
+    return line.reshape(-1).at[place].get(mode="promise_in_bounds")  # on a CPU one index is much faster than two
 
 
 def _raise(x: jax.Array, ndim: int) -> jax.Array:
-    """`x` with as many leading axes as `ndim` takes."""
+    """`x` with leading axes added up to `ndim` axes."""
     return x.reshape((1,) * (ndim - x.ndim) + x.shape)
 
 
 def _column(like: jax.Array, n: int, ndim: int) -> jax.Array:
-    """0 to n - 1 along the first of `ndim` axes, of the type of `like`."""
+    """0 to n - 1 along the first of `ndim` axes, with the dtype of `like`."""
     return jnp.arange(n, dtype=like.dtype).reshape(n, *(1,) * (ndim - 1))
 
 
 def window(line: jax.Array, first: jax.Array, lag: jax.Array, n: int) -> tuple[jax.Array, jax.Array]:
-    """The signal `lag` samples before each of the samples first, ..., first + n - 1, of which none is written yet.
+    """The signal `lag` samples before each of the samples first, ..., first + n - 1, none of which is written yet.
 
     Args:
         line: samples (L, ...), written in blocks of n.
         first: int scalar, a multiple of n.
-        lag: in samples, real, scalar or of the trailing axes; n <= lag <= L - n.
-        n: samples a block.
+        lag: in samples, real, scalar or one per entry of the trailing axes; n <= lag <= L - n.
+        n: samples per block.
 
     Returns:
-        weights (n, m) and rows (m, ...), whose product (n, ...) is the signal, linear between samples and zero before
-        sample 0. For lines side by side with one lag the rows are samples as they stand, else the weights are those
-        of the identity.
+        weights (n, m) and rows (m, ...). Their product (n, ...) is the signal, linear between samples and zero before
+        sample 0. For several lines with one lag the rows are the stored samples; otherwise the weights are the
+        identity.
     """
     whole = jnp.floor(-lag)
     start = first + whole.astype(first.dtype)
@@ -81,7 +81,7 @@ def window(line: jax.Array, first: jax.Array, lag: jax.Array, n: int) -> tuple[j
         weights = jnp.eye(n, n + 1) * (1.0 - share) + jnp.eye(n, n + 1, 1) * share
         return jnp.where(start + _column(start, n, 2) < 0, 0.0, weights), past
     share = _raise(share, line.ndim)
-    # On the grid the next sample may not be written yet: what stands in its row is older, and perhaps not finite.
+    # For a whole lag the next sample may not be written yet; its row holds an older value, perhaps not finite.
     value = past[:-1] + jnp.where(share > 0.0, (past[1:] - past[:-1]) * share, 0.0)
     number = _raise(start, line.ndim) + _column(start, n, line.ndim)
     return jnp.eye(n), jnp.where(number < 0, 0.0, value)
@@ -104,20 +104,20 @@ def read(line: jax.Array, newest: jax.Array, lag: jax.Array) -> jax.Array:
     a = line[left % rows]
     b = line[(left + 1) % rows]
     value = jnp.where(left < 0, b, a + (b - a) * (-lag - offset))
-    # Left of sample 0 lies the zero past; its pair (-1, 0) may only be held when looking ahead of sample 0.
+    # Before sample 0 the signal is zero; the pair (-1, 0) is held only when looking ahead of sample 0.
     return jnp.where((left < -1) | ((left == -1) & (lag > 0)), 0.0, value)
 
 
 def read_held(line: jax.Array, interval: jax.Array, lag: jax.Array, per_sample: int) -> jax.Array:
     """Mean over one inner interval, `lag` inner intervals ago, of a signal that is held between its samples.
 
-    Exact for a piecewise constant signal also when a jump falls inside the interval, so nothing is smeared.
+    Exact for a piecewise constant signal, even if a jump falls inside the interval.
 
     Args:
         line: samples (L,), each held for `per_sample` inner intervals.
-        interval: number of the present inner interval, int scalar; it lies within the newest sample's hold.
+        interval: number of the current inner interval, int scalar; it lies within the newest sample's hold.
         lag: in inner intervals, real scalar, 0 <= lag <= (L - 2) * per_sample.
-        per_sample: inner intervals a sample.
+        per_sample: inner intervals per sample.
     """
     chex.assert_rank([line, interval, lag], [1, 0, 0])
     whole = jnp.ceil(lag)
@@ -137,11 +137,11 @@ def held_window(line: jax.Array, newest: jax.Array, lag: jax.Array, n: int) -> t
     Args:
         line: samples (L, ...), each held for n inner intervals.
         newest: number of the newest sample, int scalar.
-        lag: in inner intervals, real, scalar or of the trailing axes, n <= lag <= (L - 2) n.
-        n: inner intervals a sample.
+        lag: in inner intervals, real, scalar or one per entry of the trailing axes, n <= lag <= (L - 2) n.
+        n: inner intervals per sample.
 
     Returns:
-        weights (n, m) and rows (m, ...), as of `window`.
+        weights (n, m) and rows (m, ...), as in `window`.
     """
     lag = lag / n
     whole = jnp.ceil(lag)

@@ -1,19 +1,19 @@
-"""What a plant's own code raises, as one message for people: which plant, where in its episode, what it said."""
+"""Errors from a plant's own code, as one readable message: which plant, where in its episode, what was raised."""
 
 from __future__ import annotations
 
-LINES, LENGTH = 3, 600  # of what it said
+LINES, LENGTH = 3, 600  # most lines and characters of its message
 
 Raised = (Exception, SystemExit)
-"""What the code of others may raise; not Ctrl-C."""
+"""What a user's code may raise; excludes Ctrl-C."""
 
 
 class PlantError(ValueError):
-    """A plant's own code failed. What it raised is the cause."""
+    """A plant's own code failed; its exception is the cause."""
 
     def __init__(self, plant: str, where: str, what: str) -> None:
-        """Args: plant: its name; where: function, or control step and episode; what: it said."""
-        super().__init__(plant, where, what)  # all of them, so that it can be pickled
+        """Args: plant: its name; where: function, or control step and episode; what: text of the exception."""
+        super().__init__(plant, where, what)  # all three, so that it can be pickled
         self.plant, self.where, self.what = plant, where, what
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
 """Electric space heaters as a mean field (paper section IV).
 
-Units: temperatures in degC, time in h, Ca in kWh/degC, Ua in kW/degC. The houses are an axis of the state; any
-parameter of a house may be one number for all or an array (n,).
+Units: temperatures in degC, time in h, Ca in kWh/degC, Ua in kW/degC. The houses are an axis of the state; each
+parameter of a house is one number for all or an array (n,).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flax import struct
 from jaxouter.plants.base import Plant, array
 
 CONTROL_STEP = 1.0  # h
-FEW = 16  # houses; the draws of fewer are too short to fill vectors
+FEW = 16  # houses; with fewer, one draw per substep would be too short to fill vector registers
 UFree = Literal["printed", "physical"]
 Law = Literal["euler-maruyama", "hourly", "lumped"]
 
@@ -50,14 +50,14 @@ class HeatersParams:
     x0_mean: jax.Array  # mean temperature at the start, degC; a number or (n,)
     x0_spread: jax.Array  # houses start at x0_mean plus or minus this, degC
     weights: jax.Array  # (n,), y = sum of weights times temperatures; (1,) when lumped
-    houses: jax.Array  # that one temperature stands for: 1, or all of them when lumped
+    houses: jax.Array  # number of houses per temperature: 1, or all of them when lumped
     law: Law = struct.field(pytree_node=False)  # how the noise of an hour is drawn
     u_free: UFree = struct.field(pytree_node=False)
-    substeps: int = struct.field(pytree_node=False)  # Euler-Maruyama steps an hour
+    substeps: int = struct.field(pytree_node=False)  # Euler-Maruyama steps per hour
 
 
 class HeatersState(NamedTuple):
-    """State of the population; lumped, n is 1 and the one temperature is the mean of all houses."""
+    """State of the population; when lumped, n is 1 and the temperature is the mean of all houses."""
 
     x: jax.Array  # (n,), air temperatures, degC
     x0: jax.Array  # (n,), temperatures at the start of the episode, degC
@@ -90,22 +90,22 @@ def make(
 
     Args:
         n: number of houses.
-        law: how the noise of an hour is drawn. From a given start, y has the same law after each hour in all three.
-            'euler-maruyama' draws every substep of every house: the scheme itself, a path for given increments.
-            'hourly' draws their sum over the hour at once, so `substeps` times fewer numbers: for many houses.
-            'lumped' knows only the mean of n identical houses, at a cost that does not depend on n: where only y is
-            looked at. `members` is then this mean as one member, and x0_spread has no effect.
+        law: how the noise of an hour is drawn. From a given start, y has the same distribution after each hour in all
+            three. 'euler-maruyama' draws every substep of every house: the scheme itself. 'hourly' draws their sum
+            over the hour at once, so `substeps` times fewer numbers: for many houses. 'lumped' simulates only the mean
+            of n identical houses, at a cost independent of n: if only y matters. `members` is then this mean as one
+            member, and x0_spread has no effect.
         x0_mean, x0_spread: houses start at x0_mean + U(-1, 1) x0_spread, recentred to the exact mean, degC.
         Ca, Ua, x_out, sigma, Pi, r_u, phi, gamma, beta2, lambda1: house and local law, see `HouseParams`; each one
-            number for all houses or an array (n,). Pi = 0.4 is the poor law of the paper, 17.186 the Riccati root.
+            number for all houses or an array (n,). Pi = 0.4 is the paper's poorly tuned law, 17.186 the Riccati root.
         gain, disturbance: multiplies u; added to u, kW.
-        weights: (n,), of the mean that is y; None: 1/n each.
-        u_free: 'printed' is the paper's -(Ua/Ca)(x_out - x0); 'physical' the power that holds x0, Ua (x0 - x_out),
-            only with Pi >= 17 (with a small Pi no r~ >= 0 could then reach 15 degC).
-        substeps: Euler-Maruyama steps an hour.
+        weights: (n,), y is the mean under these; None: 1/n each.
+        u_free: 'printed' is the paper's -(Ua/Ca)(x_out - x0). 'physical' is the power that holds x0, Ua (x0 - x_out);
+            it needs Pi >= 17 (with a small Pi no r~ >= 0 reaches 15 degC).
+        substeps: Euler-Maruyama steps per hour.
 
     Raises:
-        ValueError: a shape is wrong, n or substeps is not positive, u_free does not fit, or houses to be lumped differ.
+        ValueError: a shape is wrong, n or substeps is not positive, u_free does not fit Pi, or lumped houses differ.
     """
     for name, value in (("n", n), ("substeps", substeps)):
         if int(value) != value or value < 1:
@@ -157,7 +157,7 @@ def init(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
 def start(key: chex.PRNGKey, params: HeatersParams) -> HeatersState:
     """A training start: a mean uniform in 15..25 degC, each house within 1 degC of it.
 
-    Lumped, the mean of the n houses' deviations is drawn as a normal number of the same variance, within 1 degC.
+    When lumped, the mean of the n houses' deviations is drawn as a normal number of the same variance, within 1 degC.
     """
     key_mean, key_house = jax.random.split(key)
     shape, dtype = params.weights.shape, params.weights.dtype
@@ -178,7 +178,7 @@ def output(params: HeatersParams, state: HeatersState) -> jax.Array:
 
 
 def members(params: HeatersParams, state: HeatersState) -> jax.Array:
-    """Temperatures of the single houses (n,), degC; lumped, their mean (1,)."""
+    """Temperatures of the individual houses (n,), degC; when lumped, their mean (1,)."""
     del params
     return state.x
 
@@ -193,15 +193,15 @@ def drift(
     s_inf = r_tilde / (-p.Ua / p.Ca - p.Pi / (p.Ca**2 * p.r_u) - p.phi)
     s = s_inf + p.gamma / (p.beta2 - p.lambda1) * decay * (r_tilde - x0)
     u = -p.gain / (p.Ca * p.r_u) * (p.Pi * x + s) + p.disturbance
-    held = p.Ua / p.Ca if u_free == "printed" else p.Ua  # of the power that holds x0, for each degC
+    held = p.Ua / p.Ca if u_free == "printed" else p.Ua  # power that holds x0, per degC
     return 1.0 / p.Ca * (-p.Ua * (x - p.x_out) + u + held * (x0 - p.x_out))
 
 
 def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: chex.PRNGKey) -> HeatersState:
-    """One hour with r~ (scalar, degC) held: Euler-Maruyama, one Wiener process a house.
+    """One hour with r~ (scalar, degC) held: Euler-Maruyama, one Wiener process per house.
 
     The scheme is x_(i+1) = a x_i + h b_i + sigma h^(1/2) w_i, and b_i is affine in exp(lambda1 t_i). So the m substeps
-    are one of the length h sum a^(m-1-i), at the mean of exp(lambda1 t_i) under these weights, and their noise.
+    equal one step of length h sum a^(m-1-i), at the mean of exp(lambda1 t_i) under these weights, plus their noise.
     """
     chex.assert_rank([state.x, r_tilde], [1, 0])
     p, m, n = params.house, params.substeps, state.x.size
@@ -212,7 +212,7 @@ def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: ch
     decay = jnp.exp(p.lambda1 * (state.k.astype(state.x.dtype) * CONTROL_STEP))
     decay = decay * _left(a, [per_substep**i for i in range(m)]) / steps
     if params.law == "euler-maruyama":
-        # The numbers are the same in either shape; rows of many houses can be split over devices.
+        # Both shapes give the same numbers; rows of many houses can be split over devices.
         w = jax.random.normal(key, (m, n) if n >= FEW else (m * n,), state.x.dtype)
         noise = _left(a, list(w.reshape(m, n)))
     else:
@@ -222,7 +222,7 @@ def step(params: HeatersParams, state: HeatersState, r_tilde: jax.Array, key: ch
 
 
 def _left(a: jax.Array, terms: Sequence[Any]) -> Any:
-    """What is left at the end of what came in each of m substeps: the sum of a^(m-1-i) terms_i."""
+    """What remains after m substeps of a term added in each: the sum of a^(m-1-i) terms_i."""
     total = terms[0]
     for term in terms[1:]:
         total = a * total + term
@@ -230,7 +230,7 @@ def _left(a: jax.Array, terms: Sequence[Any]) -> Any:
 
 
 def variables(params: HeatersParams, state: HeatersState) -> HeatersState:
-    """The temperatures; where the houses started stays as it is."""
+    """The temperatures; the starting temperatures are constants."""
     del params
     return state._replace(x0=None, k=None)
 

@@ -1,9 +1,9 @@
-"""A simulator that is no JAX as a plant: a Gymnasium environment, an FMU, or anything else that has `reset` and `step`.
+"""Plants around simulators outside JAX: a Gymnasium environment, an FMU, or anything else with `reset` and `step`.
 
-Plants are pure functions, simulators are not: they move on. So the state of such a plant is the number of a moment, and
-this process remembers from which moment, by which r~, each one came. Stepping the newest moment of an episode moves its
-simulator on; stepping an older one lets a simulator go through its episode again. So a simulator must do the same again
-from the same seed. Nothing here is differentiable.
+A plant's step is a pure function, but a simulator has a state of its own. So each state a simulator has been in gets a
+number, its moment, which is the plant's state. A table holds the previous moment and the r~ that led from it. To step
+the newest moment of an episode, its simulator takes one more step. To step an older one, a simulator replays the
+episode up to there. This requires a simulator to do the same again from the same seed. Nothing here is differentiable.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ import numpy as np
 from jaxouter.plants.base import Plant
 from jaxouter.plants.errors import PlantError, Raised, said
 
-SIMULATORS = 256  # that are kept going
-TRIED = 20  # control steps by which the speed is measured where none were made yet
-START = -1  # in place of an older moment
+SIMULATORS = 256  # most simulators kept alive
+TRIED = 20  # control steps for measuring the speed if none were made yet
+START = -1  # the moment before the first one of an episode
 
 
 class Simulator(Protocol):
-    """A closed loop elsewhere. The same from the same seed, and nan from where it can't go on.
+    """A closed loop outside JAX. Reproducible from its seed; y is nan once it can't go on.
 
-    It may have an attribute `ended`: None, or why it can't go on.
+    It may have an attribute `ended`: None, or the reason why it can't go on.
     """
 
     def reset(self, seed: int) -> float:
@@ -53,10 +53,10 @@ class HostState(NamedTuple):
 
 
 class Speed(NamedTuple):
-    """What a plant outside JAX has taken so far."""
+    """Time spent in a plant outside JAX so far."""
 
     steps: int  # control steps
-    seconds: float  # in its code
+    seconds: float  # spent in its code
 
     @property
     def step_seconds(self) -> float:
@@ -65,28 +65,28 @@ class Speed(NamedTuple):
 
 
 class Moments:
-    """The simulators of one plant, by the moment at which each is."""
+    """The simulators of one plant, by their current moment."""
 
     def __init__(self, name: str, make: Callable[[], Simulator], side_by_side: int) -> None:
-        """Args: name: of the plant; make: a new simulator; side_by_side: episodes that may be under way at a time."""
+        """Args: name: of the plant; make: makes a simulator; side_by_side: episodes that may run at the same time."""
         self.name, self.side_by_side = name, side_by_side
         self.ended: str | None = None
-        """Where and why an episode could not go on: the first since this was None."""
+        """Where and why an episode could not go on: the first one since this was reset to None."""
         self._make, self._kept = make, side_by_side
-        self._before = array("i")  # the moment from which each came
-        self._by = array("d")  # by which r~; at a start, from which seed
+        self._before = array("i")  # previous moment of each
+        self._by = array("d")  # the r~ that led from it; at a start, the seed
         self._at: OrderedDict[int, Simulator] = OrderedDict()
         self._lock = threading.Lock()
         self._steps, self._seconds = 0, 0.0
 
     @property
     def speed(self) -> Speed:
-        """Control steps so far, those of episodes that were gone through again included, and their time."""
+        """Control steps so far, including replayed ones, and their time."""
         return Speed(self._steps, self._seconds)
 
     def begin(self, seeds: list[int]) -> list[tuple[int, float]]:
-        """New episodes side by side: the first moment of each, and y."""
-        self._kept = max(self._kept, 2 * len(seeds))  # as a new episode begins while others are under way
+        """Start one episode per seed: the first moment of each, and y."""
+        self._kept = max(self._kept, 2 * len(seeds))  # new episodes may begin while others still run
         return [self._begin(seed) for seed in seeds]
 
     def _begin(self, seed: int) -> tuple[int, float]:
@@ -109,7 +109,7 @@ class Moments:
         return len(self._before) - 1
 
     def _free(self, seed: int) -> Simulator:
-        """A simulator: a new one, or that of the moment that was left alone for longest."""
+        """A new simulator, or else the one that has been idle longest."""
         if len(self._at) >= self._kept:
             return self._at.popitem(last=False)[1]
         with self._guarded(lambda: f"at the start of the episode with seed {seed}"):
@@ -139,7 +139,7 @@ class Moments:
             raise PlantError(self.name, where(), said(error)) from error
 
     def _history(self, moment: int) -> tuple[int, list[float]]:
-        """The seed of a moment's episode, and every r~ up to it."""
+        """The seed of a moment's episode, and all r~ up to it."""
         inputs = []
         while (before := self._before[moment]) != START:
             inputs.append(self._by[moment])
@@ -147,12 +147,12 @@ class Moments:
         return int(self._by[moment]), inputs[::-1]
 
     def _place(self, moment: int) -> str:
-        """The control step that follows a moment, for people."""
+        """The control step after a moment, in words."""
         seed, inputs = self._history(moment)
         return f"control step {len(inputs) + 1} of the episode with seed {seed}"
 
     def _again(self, moment: int) -> Simulator:
-        """A simulator that has gone through the episode up to a moment."""
+        """A simulator that has replayed the episode up to a moment."""
         seed, inputs = self._history(moment)
         simulator = self._free(seed)
         self._reset(simulator, seed)
@@ -168,12 +168,12 @@ class Moments:
 def plant(
     make: Callable[[], Simulator], *, side_by_side: int = SIMULATORS, name: str, **declared: Any
 ) -> tuple[Plant, tuple[()]]:
-    """A plant around simulators, and its parameters: none.
+    """A plant around simulators, and its (empty) parameters.
 
     Args:
-        make: a new simulator; called as often as episodes go on side by side.
-        side_by_side: episodes that had better be under way at a time.
-        name, **declared: of `Plant`, but for its functions.
+        make: makes a simulator; called once per episode that runs at the same time.
+        side_by_side: most episodes to run at the same time.
+        name, **declared: fields of `Plant`, except its functions.
     """
     loop = _Loop(Moments(name, make, side_by_side))
     return Plant(name, loop.init, loop.step, loop.output, differentiable=False, **declared), ()
@@ -218,19 +218,19 @@ def _arrays(lanes: list[tuple[int, float]], shape: tuple[int, ...]) -> tuple[np.
 
 
 def of(plant: Plant) -> Moments | None:
-    """The simulators of a plant outside JAX, whose `speed` counts its control steps; None: its functions are JAX."""
+    """The simulators of a plant outside JAX; None for a JAX plant."""
     loop = getattr(plant.step, "__self__", None)
     return loop.moments if isinstance(loop, _Loop) else None
 
 
 def side_by_side(plant: Plant) -> int | None:
-    """Episodes of a plant that had better be under way at a time; None: as many as one likes."""
+    """Most episodes of a plant to run at the same time; None: no limit."""
     moments = of(plant)
     return None if moments is None else moments.side_by_side
 
 
 def step_seconds(plant: Plant) -> float | None:
-    """Seconds that a control step of a plant outside JAX takes, measured where none was made yet; None: it is JAX.
+    """Seconds per control step of a plant outside JAX, measured now if need be; None for a JAX plant.
 
     Raises:
         PlantError: the plant's own code failed.

@@ -1,4 +1,4 @@
-"""What a plant must keep to, so that everything else can work with it: shapes, types, purity."""
+"""Checks that a plant implements the interface: shapes, types, purity."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from jaxouter.plants.base import Plant, outputs
 from jaxouter.plants.declaration import shown
 from jaxouter.plants.errors import PlantError, said
 
-LANES = 4  # plants side by side under vmap
-STEPS = 20  # that are compared
-ROUNDING = 1e-4  # of the range of y, between two ways to compute the same
+LANES = 4  # plants under vmap
+STEPS = 20  # steps compared
+ROUNDING = 1e-4  # tolerance between two ways to compute the same y, as share of its range
 
 
 def shapes(plant: Plant, params: Any) -> None:
-    """Trace the functions of a plant, without compiling anything.
+    """Trace the functions of a plant; nothing is compiled.
 
     Raises:
-        ValueError: one of them fails, or returns what it must not; names it.
+        ValueError: a function fails, or returns something wrong; names it.
     """
     if not isinstance(plant, Plant):
         raise ValueError(f"a plant's maker must return a jaxouter.plants.Plant and its parameters, not {plant!r}")
@@ -80,10 +80,10 @@ def _of(value: Any) -> str:
 
 
 def behaviour(plant: Plant, params: Any) -> Iterator[tuple[str, str | None]]:
-    """Run the plant, and see whether it behaves as a pure function of its arguments.
+    """Run the plant, and check that it behaves as a pure function of its arguments.
 
     Yields:
-        What is asked of it, and what is wrong; None: nothing.
+        The requirement, and what is wrong; None: it is met.
     """
     low, high = plant.r_tilde_bounds
     r_tilde = jax.random.uniform(jax.random.key(1), (plant.episode_steps,), float, low, high)

@@ -1,7 +1,7 @@
 """Boeing 747 pitch control with a delayed human pilot (paper section III).
 
 Units: x1 = u, x2 = w in ft/s, x3 = q in crad/s, x4 = theta in crad (1 crad = 0.01 rad), time in s. A, B: Bryson, 747 at
-40 kft and 774 ft/s. The paper's 'Neal-Schmidt' pilot is the Neal-Smith one, 0.5 (s+1)/(5s+1) exp(-tau s).
+40 kft and 774 ft/s. The paper's 'Neal-Schmidt' pilot is the Neal-Smith pilot, 0.5 (s+1)/(5s+1) exp(-tau s).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jaxouter.plants import delay
 from jaxouter.plants.base import Plant, array
 
 CONTROL_STEP = 0.1  # s
-START_SPREAD = (1.0, 1.0, 0.5, 5.0)  # training starts are uniform in plus or minus this
+START_SPREAD = (1.0, 1.0, 0.5, 5.0)  # training starts are uniform within +- this
 
 A_747 = (
     (-0.003, 0.039, 0.0, -0.322),
@@ -53,28 +53,30 @@ class PitchParams:
     gain: jax.Array  # multiplies u
     disturbance: jax.Array  # added to u, crad
     max_delay: float = struct.field(pytree_node=False)  # s; static: sets the length of the delay lines
-    substeps: int = struct.field(pytree_node=False)  # inner steps a control step
+    substeps: int = struct.field(pytree_node=False)  # inner steps per control step
     late: tuple[bool, bool, bool] | None = struct.field(pytree_node=False)
-    """Which of theta, K1 x and K2 xc are late, that is delayed by more than a control step; the others are not delayed
-    at all. Then a control step is one matrix product. None: inner step by inner step, for any delays."""
+    """Which of theta, K1 x and K2 xc are delayed by more than a control step; the others must have no delay. A control
+    step is then one matrix product. None: any delays, simulated in inner steps."""
 
 
 class PitchState(NamedTuple):
     """State of the pitch plant; all zero at rest.
 
-    Trailing axes may be added to all but `k`: plants side by side that began together.
+    All but `k` may have trailing axes, for several plants that started together.
     """
 
     x: jax.Array  # (4,), [u ft/s, w ft/s, q crad/s, theta crad]
     xc: jax.Array  # integral of theta - c, crad s
     xi: jax.Array  # pilot
-    lines: jax.Array  # (3, L), delay lines of theta, K1 x and K2 xc, a sample an inner step; of the late ones, if told
-    r_tilde_line: jax.Array  # (M,), delay line of r~, a sample a control step
+    lines: (
+        jax.Array
+    )  # (3, L), delay lines of theta, K1 x, K2 xc (only the late ones, if set), one sample per inner step
+    r_tilde_line: jax.Array  # (M,), delay line of r~, one sample per control step
     k: jax.Array  # int32, control steps since the start
 
 
 def lqr(A: Any, B: Any, Q: Any, R: float) -> tuple[np.ndarray, float]:
-    """Gains of the paper's controller: LQR on [x; xc] with xc' = x4 (the pilot left out).
+    """Gains of the paper's controller: LQR on [x; xc] with xc' = x4 (without the pilot).
 
     Returns:
         K1 (4,) and K2, of u = -K1 x - K2 xc.
@@ -118,14 +120,14 @@ def make(
         tau, d1, d2: delays of pilot, state feedback and integral feedback, s; any real number in [0, max_delay].
         W: uncertainty. The printed (0.1, 0.3, -0.3) makes the loop unstable; the default has x1, x2 in hundreds.
         A, B, A_h, B_h, C_h, D_h: aircraft and pilot.
-        Q, R: weights of the LQR design, (5,) diagonal and a number; unused where K1 and K2 are given.
+        Q, R: weights of the LQR design, (5,) diagonal and a number; unused if K1 and K2 are given.
         K1, K2: gains; None: the LQR gains of A, B, Q, R.
         gain, disturbance: multiplies u; added to u, crad.
-        max_delay: longest delay the lines can hold, s. Where it is given, the plant serves every delay in
-            [0, max_delay] (a sweep), inner step by inner step. None: the largest of the three, and if it can be (tau is
-            more than a control step, d1 and d2 too or zero) whole control steps, which is many times faster and serves
-            all delays between.
-        substeps: inner steps a control step of 0.1 s; at least 10, so that none is longer than 0.01 s.
+        max_delay: longest delay the lines can hold, s. If given, the plant takes every delay in [0, max_delay] (for a
+            sweep) and is simulated in inner steps. None: the largest of the three delays. The plant is then simulated
+            in whole control steps, many times faster, if tau exceeds a control step and d1 and d2 are longer than one
+            or zero.
+        substeps: inner steps per control step of 0.1 s; at least 10, so that none is longer than 0.01 s.
 
     Raises:
         ValueError: a delay is negative or above max_delay, a shape is wrong, or there are too few substeps.
@@ -166,29 +168,29 @@ def make(
 
 
 def _late(substeps: int, tau: float, d1: float, d2: float) -> tuple[bool, bool, bool] | None:
-    """`PitchParams.late` of given delays, s."""
+    """`PitchParams.late` for these delays, s."""
     fits = tau > 0.0 and all(delay == 0.0 or delay >= _least_late(substeps) for delay in (tau, d1, d2))
     return (True, d1 > 0.0, d2 > 0.0) if fits else None
 
 
 def _least_late(substeps: int) -> float:
-    """The least delay, s, with which nothing of a control step acts within it: half an inner step more than it."""
+    """The least delay, s, with which no sample of a control step acts within that step: half an inner step more."""
     return CONTROL_STEP + CONTROL_STEP / substeps / 2 - 1e-6
 
 
 def _enough(*delays: float) -> float:
-    """The smallest `max_delay` that serves these delays, s."""
+    """The smallest `max_delay` for these delays, s."""
     return max(0.0, math.ceil(round(max(delays) / CONTROL_STEP, 5)) * CONTROL_STEP)
 
 
 def smallest(params: PitchParams) -> PitchParams:
-    """The same plant with the shortest delay lines that serve it, in whole control steps if it can be."""
+    """The same plant with the shortest delay lines it needs, in whole control steps if possible."""
     delays = dict(tau=float(params.tau), d1=float(params.d1), d2=float(params.d2))
     return dataclasses.replace(params, max_delay=_enough(*delays.values()), late=_late(params.substeps, **delays))
 
 
 def widened(params: PitchParams, ranges: Mapping[str, tuple[float, float]]) -> PitchParams:
-    """The same plant with delay lines for delays in these ranges, then inner step by inner step.
+    """The same plant with delay lines for delays in these ranges, then simulated in inner steps.
 
     Raises:
         ValueError: a delay may be negative.
@@ -222,13 +224,13 @@ def init(key: chex.PRNGKey, params: PitchParams) -> PitchState:
 
 
 def start(key: chex.PRNGKey, params: PitchParams) -> PitchState:
-    """A training start: x uniform in plus or minus `START_SPREAD`, the rest as at rest."""
+    """A training start: x uniform within +- `START_SPREAD`, the rest zero."""
     spread = jnp.asarray(START_SPREAD)
     return init(key, params)._replace(x=jax.random.uniform(key, (4,), spread.dtype, -spread, spread))
 
 
 def reuse(old: PitchState, fresh: PitchState) -> PitchState:
-    """The fresh state with the old lines: before the start of an episode they count as zero, whatever they hold."""
+    """The fresh state with the old lines: reads before the start of an episode give zero, whatever they hold."""
     return fresh._replace(lines=old.lines, r_tilde_line=old.r_tilde_line)
 
 
@@ -241,10 +243,10 @@ def output(params: PitchParams, state: PitchState) -> jax.Array:
 def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.PRNGKey) -> PitchState:
     """One control step of 0.1 s with r~ (scalar, crad) held.
 
-    The delay-free part is linear and propagated exactly; the delayed inputs are held over an inner step at their value
-    in its middle (r~: at its mean), which makes the whole second order. A delay that the parameters do not serve gives
-    NaN. Without vmap also for many plants that began together (see `PitchState`) with whole control steps: r~ and the
-    delays may then have their trailing axes.
+    The delay-free part is linear and propagated exactly. Delayed inputs are held over an inner step at their midpoint
+    value (r~: at its mean), which makes the scheme second order. A delay outside what the parameters were made for
+    gives NaN. With whole control steps, many plants that started together can be stepped without vmap (see
+    `PitchState`): r~ and the delays may have trailing axes.
 
     Source: paper section III; what the paper leaves out is in docs/reproduction.md.
     """
@@ -260,7 +262,7 @@ def step(params: PitchParams, state: PitchState, r_tilde: jax.Array, key: chex.P
 
 
 def _served(p: PitchParams) -> jax.Array:
-    """Whether the plant is made for these delays."""
+    """Whether the parameters were made for these delays."""
     delays, late = (p.tau, p.d1, p.d2), p.late or (False, False, False)
     least = _least_late(p.substeps)
     bounds = [(least, p.max_delay) if is_late else (0.0, 0.0 if p.late else p.max_delay) for is_late in late]
@@ -271,7 +273,7 @@ def _served(p: PitchParams) -> jax.Array:
 def _whole_step(
     p: PitchParams, z: jax.Array, lines: jax.Array, r_tilde_line: jax.Array, k: jax.Array, lags: list[jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """[x; xc; xi] and the lines after a control step in which all that is delayed is known at its start."""
+    """[x; xc; xi] and the lines after a control step, when all delayed signals are known at its start."""
     assert p.late is not None
     n, first = p.substeps, k * p.substeps
     late = [i for i in range(3) if p.late[i]]
@@ -281,7 +283,7 @@ def _whole_step(
     constant = (p.disturbance + p.W[0]) * jnp.sum(of_u, 1, keepdims=True)
     parts = [(of_z, z), (constant, jnp.ones_like(z[:1]))]
     delayed = [(of_theta_e, asked), (-of_theta_e, theta), *((-p.gain * of_u, signal) for signal in fed_back)]
-    if z.ndim > 1 and all(lag.ndim == 0 for lag in lags):  # all is linear in rows as they stand: one product
+    if z.ndim > 1 and all(lag.ndim == 0 for lag in lags):  # linear in the stored rows: one matrix product
         parts += [(_dot(matrix, weights), rows) for matrix, (weights, rows) in delayed]
         out = _stacked(parts)
     else:
@@ -293,15 +295,15 @@ def _whole_step(
 
 
 def _stacked(parts: list[tuple[jax.Array, jax.Array]]) -> jax.Array:
-    """Sum of the products of matrices (m, n_i) and rows (n_i, ...), as one."""
+    """Sum of the products of matrices (m, n_i) and rows (n_i, ...), computed as one product."""
     matrices, rows = zip(*parts, strict=True)
     return _dot(jnp.concatenate(matrices, 1), jnp.concatenate(rows))
 
 
 def _propagator(p: PitchParams, late: list[int]) -> jax.Array:
-    """(6 + S n, 6 + 2 n): [x; xc; xi] after a control step and the n samples of the S late signals within it.
+    """(6 + S n, 6 + 2 n): map to [x; xc; xi] after a control step and the n samples of the S late signals within it.
 
-    From [x; xc; xi] at its start, theta_e and the delayed part of u in its n inner steps.
+    It maps from [x; xc; xi] at the start, and theta_e and the delayed part of u in the n inner steps.
     """
     n = p.substeps
     one = _discretise(p, CONTROL_STEP / n, [i for i in (1, 2) if i not in late])
@@ -316,7 +318,7 @@ def _propagator(p: PitchParams, late: list[int]) -> jax.Array:
 def _inner_steps(
     p: PitchParams, z: jax.Array, lines: jax.Array, r_tilde_line: jax.Array, k: jax.Array, lags: list[jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """[x; xc; xi] and the lines after a control step, with any delays."""
+    """[x; xc; xi] and the lines after a control step, for any delays."""
     transition = _discretise(p, CONTROL_STEP / p.substeps, [])
 
     def inner(carry: tuple[jax.Array, jax.Array], i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
@@ -333,7 +335,7 @@ def _inner_steps(
 
 
 def variables(params: PitchParams, state: PitchState) -> PitchState:
-    """The state without clock, its lines from the oldest to the newest sample."""
+    """The state without the clock, and with the lines from the oldest to the newest sample."""
     lines = state.lines if params.late is None else state.lines[:, : -params.substeps]  # without the mirror
     return state._replace(
         lines=jnp.roll(lines, -state.k * params.substeps, axis=1),
@@ -343,7 +345,7 @@ def variables(params: PitchParams, state: PitchState) -> PitchState:
 
 
 def settled(params: PitchParams, state: PitchState, variables: PitchState) -> PitchState:
-    """These variables at a clock at which the next sample of every line belongs in row 0, late enough to fill them."""
+    """The state with these variables, at a late clock at which the next sample of every line goes into row 0."""
     lines = variables.lines
     k = lines.shape[1] * state.r_tilde_line.shape[0]
     if params.late is not None:
@@ -352,10 +354,10 @@ def settled(params: PitchParams, state: PitchState, variables: PitchState) -> Pi
 
 
 def _discretise(p: PitchParams, h: float, undelayed: list[int]) -> jax.Array:
-    """(6, 8): [x; xc; xi] after an inner step of h, from [x; xc; xi; theta_e; u + W1] at its start.
+    """(6, 8): map from [x; xc; xi; theta_e; u + W1] at the start of an inner step of h to [x; xc; xi] at its end.
 
-    The parts of u that are `undelayed` (1: K1 x, 2: K2 xc) act through the state, not through u. The exponential is
-    summed to order 6, exact in double precision for ||F h|| < 0.1.
+    `undelayed` parts of u (1: K1 x, 2: K2 xc) act through the state, not through u. The exponential is summed to order
+    6, which is exact in double precision for ||F h|| < 0.1.
     """
     F = jnp.zeros((8, 8))
     F = F.at[:4, :4].set(p.A + p.B[:, None] * jnp.stack([p.W[1], p.W[2], *jnp.zeros(2)])[None, :])

@@ -1,11 +1,11 @@
-"""Plants by reference: what a command line may name in place of `pitch` or `heaters`.
+"""Plant registry: plants that a command line may name instead of `pitch` or `heaters`.
 
-`FILE.py:NAME` is a plant of one's own, in a file: a function that returns the plant and its parameters, as
-`jaxouter.plants.pitch.make` does. An installed package may offer one as an entry point of the group `jaxouter.plants`.
-`gym:ID` and `fmu:FILE` are simulated elsewhere; `log:FILE` is what a record of r~ and y tells of a plant.
+`FILE.py:NAME` is your own plant: a function in a file that returns the plant and its parameters, like
+`jaxouter.plants.pitch.make`. An installed package may provide one as an entry point of the group `jaxouter.plants`.
+`gym:ID` and `fmu:FILE` run in another simulator; `log:FILE` is a model identified from recorded r~ and y.
 
-A plant is imported only because a command line names it, never because a run folder does. It is then known by a short
-name, in scenarios (`Tank/steps`) and in folders (`runs/Tank-default-0`).
+A plant is imported only if a command line names it, never because a run folder does. Scenarios (`Tank/steps`) and
+folders (`runs/Tank-default-0`) use its short name.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KINDS: dict[str, Callable[[str, str, PlantOptions], tuple[Plant, Any]]] = {
     "gym": simulators.from_gymnasium,
     "fmu": simulators.from_fmu,
 }
-"""Makers of plants KIND:WHICH, by kind; `jaxouter.identification`, which stands on the plants, adds log:FILE."""
+"""Makers of plants KIND:WHICH, by kind. `jaxouter.identification` adds log:FILE, as plants do not depend on it."""
 FORMS = "FILE.py:NAME, gym:ID, fmu:FILE, log:FILE"
 
 
@@ -46,15 +46,19 @@ class Registration(NamedTuple):
 
     reference: str
     options: PlantOptions
-    sha256: str  # of its file
+    sha256: str  # of the plant's file
 
 
 REGISTRATIONS: dict[str, Registration] = {}
-"""By the short name, of all plants that were added."""
+"""All added plants, by short name."""
 
 
 def attribute(path: Path, name: str, what: str) -> Any:
-    """What a Python file of the user's calls `name`; `what` it is to be is said where it isn't there.
+    """The object called `name` in a user's Python file.
+
+    Args:
+        path, name: the file and the name in it.
+        what: what it should be, for the error message.
 
     Raises:
         ValueError: there is no such file or name, or the file can't be imported.
@@ -63,7 +67,7 @@ def attribute(path: Path, name: str, what: str) -> Any:
     if not path.is_file() or spec is None or spec.loader is None:
         raise ValueError(f"{path} is not a Python file; {what} is named FILE.py:NAME")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for what their annotations name
+    sys.modules[spec.name] = module  # dataclasses resolve their annotations there
     try:
         spec.loader.exec_module(module)
     except Raised as error:
@@ -74,10 +78,10 @@ def attribute(path: Path, name: str, what: str) -> Any:
 
 
 def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa: B008 - frozen
-    """Make the plant that a command line names known, and give its short name, by which `plants.make` finds it.
+    """Register the plant that a command line names; returns the short name by which `plants.make` finds it.
 
     Raises:
-        ValueError: there is none, it breaks the contract, or its short name is another plant's.
+        ValueError: there is no such plant, it does not implement the interface, or its short name is taken.
     """
     if reference in plants.REGISTRY and reference not in REGISTRATIONS:
         _plain(reference, options)
@@ -137,7 +141,7 @@ def _short(text: str) -> str:
 
 
 def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., tuple[Plant, Any]]:
-    """The same maker, whose plant has this name: one that equals itself, however often it is made."""
+    """The maker with the plant renamed and cached, so that the same plant is equal each time it is made."""
     if not callable(make):
         raise ValueError(f"{name} is {make!r}; it must be a function that returns a plant and its parameters")
 
@@ -160,7 +164,7 @@ def _named(name: str, make: Callable[..., tuple[Plant, Any]]) -> Callable[..., t
 
 
 def _guarded(plant: Plant) -> Plant:
-    """The same plant, whose functions say by which of them an error was made."""
+    """The same plant, but errors in its functions name the function."""
     own = [name for name, kind in declaration.PLANT.items() if kind.function and callable(getattr(plant, name))]
     if plant.variables is float_leaves:
         own = [name for name in own if name not in ("variables", "settled")]
@@ -183,7 +187,7 @@ def _guarded(plant: Plant) -> Plant:
 
 
 class _Kept(logging.Filter):
-    """Keeps the last exception that JAX logs, and lets none be written."""
+    """Keeps the last exception that JAX logs, and suppresses the log entry."""
 
     last: BaseException | None = None
 
@@ -194,23 +198,23 @@ class _Kept(logging.Filter):
 
 
 CALLBACKS = ("jax._src.callback", "jax._src.debugging")
-"""Loggers to which JAX tells what a function raised that it called back."""
+"""Loggers to which JAX writes the exceptions of callbacks."""
 
 
 @contextmanager
 def own_errors() -> Iterator[None]:
-    """What a plant's code raises where JAX calls it back comes out as it was raised, not in the wrappings of XLA.
+    """Re-raise errors of a plant's code in JAX callbacks as they were raised, without XLA's wrapping.
 
     Raises:
-        PlantError: it did.
-        KeyboardInterrupt: it was interrupted.
+        PlantError: the plant's code failed.
+        KeyboardInterrupt: Ctrl-C in the plant's code.
     """
     kept, loggers = _Kept(), [logging.getLogger(name) for name in CALLBACKS]
     for logger in loggers:
-        logger.filters.insert(0, kept)  # before that of a block around this one
+        logger.filters.insert(0, kept)  # before the filter of an enclosing block
     try:
         yield
-    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises one or the other
+    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises either
         last = kept.last
         if isinstance(error, PlantError) or "callback" not in str(error):
             raise

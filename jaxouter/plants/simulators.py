@@ -1,4 +1,4 @@
-"""Plants that are simulated elsewhere: `gym:ID`, a Gymnasium environment, and `fmu:FILE`, an FMU for co-simulation."""
+"""Plants in other simulators: `gym:ID`, a Gymnasium environment, and `fmu:FILE`, an FMU for co-simulation."""
 
 from __future__ import annotations
 
@@ -24,40 +24,40 @@ from jaxouter.plants.base import Plant
 from jaxouter.plants.cosimulation import Apart, FmuError, Instance, Setup
 from jaxouter.plants.errors import Raised, said
 
-EPISODE = 200  # control steps, where nothing says how long
-APART = 16  # episodes under way of an FMU that takes a process for each
-NOTICED = 0.01  # s, from which on it is said how long an episode takes to begin
+EPISODE = 200  # default control steps of an episode
+APART = 16  # most episodes at the same time of an FMU that needs a process for each
+NOTICED = 0.01  # s; if an episode takes longer to begin, the warning says so
 ROUNDING = 1e-6  # control steps
 
 
 @dataclass(frozen=True)
 class PlantOptions:
-    """What a plant from elsewhere (gym:, fmu:, log:) does not say itself. A JAX plant declares all of it."""
+    """What a plant gym:, fmu: or log: does not declare itself. A JAX plant declares all of it."""
 
     y_index: int = 0
-    """gym: which number of the observation, flattened, is y."""
+    """gym: index of y in the flattened observation."""
     input: str | None = None
-    """fmu: the variable that is r~; default: the only input."""
+    """fmu: name of the variable for r~; default: the only input."""
     output: str | None = None
-    """fmu: the variable that is y; default: the only output."""
+    """fmu: name of the variable for y; default: the only output."""
     r_tilde_bounds: tuple[float, float] | None = None
-    """Least and greatest r~; default: those of the action, of the FMU's input, or of the log."""
+    """Least and greatest r~; default: the bounds of the action or of the FMU's input, or the recorded range."""
     setpoint_range: tuple[float, float] | None = None
-    """Set-points to train and evaluate on; default: the middle half of the range of r~, of a log what it reached."""
+    """Set-points to train and evaluate on; default: the middle half of the range of r~; log: what y has reached."""
     control_step: float | None = None
-    """Length of a control step; default: what gym: calls `dt`, else 1; the FMU's step size."""
+    """Length of a control step; default: the environment's `dt` or else 1; the FMU's step size."""
     episode_steps: int | None = None
-    """Control steps of an episode; default: the environment's limit, else 200; of a log from its settling time."""
+    """Control steps of an episode; default: the environment's limit or else 200; log: by the settling time."""
     y_unit: str | None = None
     """Unit of y and r~."""
     validate: bool = True
-    """fmu: whether its description must keep to the standard."""
+    """fmu: refuse a description that violates the FMI standard."""
 
     def declared(self, **defaults: Any) -> dict[str, Any]:
-        """The declaration: these where they are given, else the defaults.
+        """The declaration: these options if given, else the defaults.
 
         Raises:
-            ValueError: what has no default is not given, or a value is not allowed; names the option.
+            ValueError: an option without default is missing, or a value is not allowed; names the option.
         """
         kinds = {
             name: declaration.PLANT[name] for name in ("setpoint_range", "control_step", "episode_steps", "y_unit")
@@ -72,7 +72,7 @@ class PlantOptions:
         low, high = whole["r_tilde_bounds"]
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise ValueError(
-                f"r~ lies between {low:g} and {high:g}: give it finite bounds, by --r-tilde-bounds LOW HIGH"
+                f"the bounds of r~ are {low:g} and {high:g}; give finite ones with --r-tilde-bounds LOW HIGH"
             )
         whole.setdefault("setpoint_range", ((3 * low + high) / 4, (low + 3 * high) / 4))
         return whole
@@ -87,10 +87,10 @@ def _gymnasium() -> Any:
 
 
 def file_of(identifier: str) -> Path:
-    """The file that holds a Gymnasium environment's class; an identifier may begin with a module, as in `make`.
+    """The file of a Gymnasium environment's class; the identifier may begin with a module, as in `gymnasium.make`.
 
     Raises:
-        ValueError: Gymnasium is not there, or knows no such environment.
+        ValueError: Gymnasium is not installed, or has no such environment.
     """
     gymnasium = _gymnasium()
     module, _, identifier = identifier.rpartition(":")
@@ -104,7 +104,7 @@ def file_of(identifier: str) -> Path:
 
 @contextmanager
 def _made(what: str) -> Iterator[None]:
-    """Whatever making a simulator raises is a ValueError; it may be the code of others."""
+    """Turn any error in making a simulator, which may be a user's code, into a ValueError."""
     try:
         yield
     except Raised as error:
@@ -112,7 +112,7 @@ def _made(what: str) -> Iterator[None]:
 
 
 class _Gym:
-    """A Gymnasium environment whose action is r~; nan after its end."""
+    """A Gymnasium environment whose action is r~; y is nan after its end."""
 
     def __init__(self, environment: Any, y_index: int) -> None:
         self._environment, self._y_index, self._done = environment, y_index, 0
@@ -138,10 +138,10 @@ class _Gym:
 
 
 def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[Plant, tuple[()]]:
-    """The plant in a Gymnasium environment with one continuous action, which becomes r~; its reward is not looked at.
+    """The plant in a Gymnasium environment with one continuous action, which becomes r~; its reward is ignored.
 
     Raises:
-        ValueError: Gymnasium is not there, knows no such environment, or it has other spaces.
+        ValueError: Gymnasium is not installed or has no such environment, or its spaces do not fit.
     """
     gymnasium = _gymnasium()
 
@@ -179,21 +179,21 @@ def from_gymnasium(name: str, identifier: str, options: PlantOptions) -> tuple[P
 def _plant(
     make: Callable[[], host.Simulator], name: str, time_unit: str, declared: dict[str, Any], **rest: Any
 ) -> tuple[Plant, tuple[()]]:
-    """The plant of such simulators: no episode is longer than one of the training, as they may end after it."""
+    """The plant of these simulators. Evaluation episodes are as long as training ones, as simulators may end then."""
     return host.plant(make, name=name, time_unit=time_unit, family_steps=declared["episode_steps"], **declared, **rest)
 
 
 def _attribute(variable: Any, attribute: str) -> str | None:
-    """An attribute of an FMU's variable, which may stand in its declared type."""
+    """An attribute of an FMU's variable, or else of its declared type."""
     own = getattr(variable, attribute)
     return getattr(variable.declaredType, attribute, None) if own is None else own
 
 
 def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[()]]:
-    """The plant in an FMU for co-simulation (FMI 2 or 3), from one of its inputs to one of its outputs.
+    """The plant in an FMU for co-simulation (FMI 2 or 3), from one input to one output.
 
     Raises:
-        ValueError: FMPy is not there, the file is no such FMU, it has other variables, or it fails at once.
+        ValueError: FMPy is not installed, the file is no such FMU, its variables do not fit, or it fails at once.
     """
     description, folder = _extracted(path, options.validate)
     given, seen = (_variable(description, causality, getattr(options, causality), path) for causality in _CAUSALITIES)
@@ -201,7 +201,7 @@ def from_fmu(name: str, path: str, options: PlantOptions) -> tuple[Plant, tuple[
         experiment = _Experiment.of(description)
         bounds = tuple(float(_attribute(given, end) or math.nan) for end in ("min", "max"))
     except ValueError as error:
-        raise ValueError(f"{path} says what is no number: {error}") from None
+        raise ValueError(f"{path} has an attribute that is not a number: {error}") from None
     asked = experiment.step or 1.0 if options.control_step is None else options.control_step
     control_step = experiment.check(declaration.checked(declaration.POSITIVE, "--control-step", asked))
     declared = options.declared(
@@ -230,7 +230,7 @@ _CAUSALITIES = ("input", "output")
 
 
 def _extracted(path: str, validate: bool) -> tuple[Any, str]:
-    """Description of an FMU, and the folder to which it was extracted, until this process ends."""
+    """Description of an FMU, and the folder to which it is extracted until this process ends."""
     try:
         import fmpy
         from fmpy.model_description import ValidationError
@@ -241,8 +241,8 @@ def _extracted(path: str, validate: bool) -> tuple[Any, str]:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         description = fmpy.read_model_description(folder, validate=validate)
     except ValidationError as error:
-        raise ValueError(f"{path}: {error}\nMend it, or take it as it is by --no-validate") from None
-    except Exception as error:  # whatever a file that is none makes FMPy raise
+        raise ValueError(f"{path}: {error}\nFix it, or accept it with --no-validate") from None
+    except Exception as error:  # FMPy may raise anything on a file that is not an FMU
         raise ValueError(f"{path} is not a readable FMU: {said(error)}") from None
     if description.coSimulation is None or not str(description.fmiVersion).startswith(("2", "3")):
         raise ValueError(f"{path} is FMI {description.fmiVersion}; it must be FMI 2 or 3, for co-simulation")
@@ -250,7 +250,7 @@ def _extracted(path: str, validate: bool) -> tuple[Any, str]:
 
 
 def _variable(description: Any, causality: str, asked: str | None, path: str) -> Any:
-    """The variable that is asked for, or the only one of its causality."""
+    """The variable with the given name, or the only one of this causality."""
     known = {
         variable.name: variable
         for variable in description.modelVariables
@@ -262,17 +262,17 @@ def _variable(description: Any, causality: str, asked: str | None, path: str) ->
 
 
 class _Experiment(NamedTuple):
-    """What an FMU says of its time, s; None: nothing."""
+    """The FMU's declared times, s; None: not declared."""
 
     start: float
     stop: float | None
     step: float | None
-    fixed: float | None  # of which a communication step must be a multiple
+    fixed: float | None  # fixed internal step; a communication step must be a multiple of it
 
     @classmethod
     def of(cls, description: Any) -> _Experiment:
-        said, interface = description.defaultExperiment, description.coSimulation
-        pairs = (said, "startTime"), (said, "stopTime"), (said, "stepSize"), (interface, "fixedInternalStepSize")
+        default, own = description.defaultExperiment, description.coSimulation
+        pairs = (default, "startTime"), (default, "stopTime"), (default, "stepSize"), (own, "fixedInternalStepSize")
         values = [getattr(where, name, None) for where, name in pairs]
         start, stop, step, fixed = (None if value is None else float(value) for value in values)
         return cls(start or 0.0, stop, step or fixed, fixed)
@@ -282,7 +282,7 @@ class _Experiment(NamedTuple):
         return None if self.stop is None else max(1, math.floor((self.stop - self.start) / control_step + ROUNDING))
 
     def check(self, control_step: float) -> float:
-        """The control step; raises ValueError where it is no multiple of a fixed one."""
+        """The control step; raises ValueError if it is not a multiple of the fixed internal step."""
         if self.fixed is not None:
             times = control_step / self.fixed
             if round(times) < 1 or abs(times - round(times)) > ROUNDING * times:
@@ -296,13 +296,13 @@ class _Experiment(NamedTuple):
 def _started(
     name: str, setup: Setup, once: bool, own_step: float | None, r_tilde: float
 ) -> tuple[Callable[[], Any], Instance | Apart]:
-    """How instances of an FMU are made, and the first; whether it can be reset, and made twice, is found by trying.
+    """A maker of instances of an FMU, and the first one. Tries whether the FMU can be reset and made twice.
 
     Args:
         name: of the plant.
-        setup: how it is run.
-        once: whether it says itself that a process may have one instance.
-        own_step: the step size that it says, s.
+        setup: how to run it.
+        once: whether it declares that a process may have only one instance.
+        own_step: its declared step size, s.
         r_tilde: for the steps of this trial.
 
     Raises:
@@ -333,7 +333,7 @@ def _started(
     seconds = time.perf_counter() - begun
     whys = ["can be instantiated once per process"] * (kind is Apart)
     whys += [] if trouble is None else [f"can't be reset ({trouble})"]
-    if whys and multiprocessing.parent_process() is None:  # else it was said there
+    if whys and multiprocessing.parent_process() is None:  # in a child process the parent has warned already
         own = f"a process of its own, {APART} at a time" if kind is Apart else "an instance of its own"
         slow = f", which takes {seconds:.1g} s to begin" if seconds > NOTICED else ""
         warnings.warn(f"{name} {' and '.join(whys)}; each episode has {own}{slow}", stacklevel=2)
@@ -366,10 +366,10 @@ def _trouble_with_reset(instance: Instance | Apart, setup: Setup, own_step: floa
 
 
 def _check_whole(instance: Instance | Apart, declared: dict[str, Any], experiment: _Experiment) -> None:
-    """That an FMU goes on beyond its stop time, where the episode does.
+    """Check that an FMU goes on beyond its stop time if an episode is longer.
 
     Raises:
-        ValueError: it doesn't.
+        ValueError: it does not.
     """
     asked, most = declared["episode_steps"], experiment.most(declared["control_step"])
     if most is None or asked <= most:

@@ -1,4 +1,4 @@
-"""Versions of jaxlib that must not be used; the package's requirements exclude them, an environment may hold them."""
+"""Versions of jaxlib that must not be used; the requirements exclude them, but an environment may still have one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FAULTS = {
 
 
 def warn(installed: str | None = None) -> None:
-    """Warn where the installed jaxlib (None: look it up) is one of `FAULTS`."""
+    """Warn if the installed jaxlib (None: look it up) is one of `FAULTS`."""
     installed = version("jaxlib") if installed is None else installed
     if installed in FAULTS:
         warnings.warn(

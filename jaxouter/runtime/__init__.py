@@ -1,4 +1,4 @@
-"""The controller in a real control loop (NumPy alone), learning live, and environments for Gymnasium."""
+"""The controller in a real control loop (NumPy only), live learning, and environments for Gymnasium."""
 
 from jaxouter.runtime.controller import Controller
 

@@ -1,4 +1,4 @@
-"""The learned controller in a real control loop. NumPy alone; imports no JAX."""
+"""The learned controller in a real control loop. NumPy only; imports no JAX."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ REASONS: tuple[Reason, ...] = get_args(Reason)
 
 
 class Event(NamedTuple):
-    """A change of what the controller does."""
+    """A switch between control and pass-through."""
 
     step: int
     time: float | None
     what: Literal["control", "pass through"]
-    why: Reason | None  # None: nothing stands against control
+    why: Reason | None  # None: it controls
 
 
 class Row(NamedTuple):
-    """A control step, as it came and as it was answered."""
+    """One control step: r and y as measured, and the r~ applied."""
 
     step: int
     time: float | None
@@ -39,30 +39,30 @@ class Row(NamedTuple):
 
 @dataclass
 class Watch:
-    """Looks at the samples: what speaks against control, and what stands in for those that are no numbers."""
+    """Checks the samples: finds reasons against control, and substitutes the last valid ones for invalid ones."""
 
     r: float
-    """Last one that is a number; at first what was given."""
+    """Last finite r; at first the given one."""
     y: float
-    """The same."""
+    """Last finite y; at first the given one."""
     y_range: tuple[float, float]
     control_step: float
     late_after: float
     return_after: int
     time: float | None = None
     elapsed: float | None = None
-    """Control steps since the sample before; None: unknown."""
+    """Control steps since the previous sample; None: unknown."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError, naming setting, value and what is allowed."""
+        """Raises ValueError if a setting is wrong; names the setting, its value and what is allowed."""
         _check_range("y_range", self.y_range)
         if not self.late_after > 1:
             raise ValueError(f"late_after is {self.late_after}; it must be more than 1 control step")
         _check_at_least_1("return_after", self.return_after)
-        self._good = self.return_after  # samples in a row
+        self._good = self.return_after  # good samples in a row
 
     def judge(self, r: float | None, y: float | None, time: float | None) -> Reason | None:
-        """What speaks against control at this sample; None: nothing."""
+        """The reason against control at this sample; None: there is none."""
         self.elapsed = None
         if _is_number(time) and self.time is not None:
             self.elapsed = (time - self.time) / self.control_step
@@ -86,24 +86,24 @@ class Watch:
         return None
 
     def within(self) -> tuple[float, float]:
-        """R and y for the spec: the last that are numbers, clipped to where it knows y."""
+        """R and y for the spec: the last finite ones, clipped to `y_range`."""
         return _clip(self.r, self.y_range), _clip(self.y, self.y_range)
 
 
 @dataclass
 class Transfer:
-    """From the r~ that is wanted to the one that is applied: within bounds, of limited rate, without bumps."""
+    """From the wanted r~ to the applied one: bounds, rate limit, bumpless transfer."""
 
     r_tilde: float | None
-    """Last applied; None: unknown."""
+    """Last applied r~; None: unknown."""
     bounds: tuple[float, float]
     rate_limit: float
     steps: int
     controls: bool | None = None
-    """What was wanted last: the spec's r~, or r; None: nothing yet."""
+    """Whether the last wanted r~ was the spec's (True) or r (False); None: nothing yet."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError, naming setting, value and what is allowed."""
+        """Raises ValueError if a setting is wrong; names the setting, its value and what is allowed."""
         low, high = self.bounds
         _check_range("bounds", self.bounds)
         if self.r_tilde is not None and not low <= self.r_tilde <= high:
@@ -128,30 +128,29 @@ class Transfer:
 
 
 class Controller:
-    """The spec in a control loop: `step(r, y)` once a control step gives the r~ to apply until the next one.
+    """The spec in a control loop: call `step(r, y)` once per control step, and apply the r~ it returns until the next.
 
         controller = Controller.load("controller.npz", engaged=False)
         r_tilde = controller.step(r, y)
 
-    It controls, or it passes through, which is r~ = r; then `reason` says why:
+    It either controls or passes r through (r~ = r); `reason` then says why:
 
-    - `disengaged`: by `disengage`, or not yet engaged.
+    - `disengaged`: by `disengage`, or not engaged yet.
     - `missing`: r or y is None.
     - `not finite`: r, y or the time is NaN or infinite.
-    - `late`: more than `late_after` control steps since the sample before. Needs a time.
-    - `out of range`: r or y lies outside `y_range`.
-    - `returning`: the samples are good again, but not yet `return_after` of them in a row.
+    - `late`: more than `late_after` control steps since the previous sample. Needs a time.
+    - `out of range`: r or y is outside `y_range`.
+    - `returning`: the samples are good again, but fewer than `return_after` in a row so far.
 
-    Where several hold, the first of these stands. In place of an r that is no number the last one passes.
+    If several hold, the first in this list is reported. If r is not finite, the last finite one passes through.
 
-    r~ stays within `bounds`, and moves by at most `rate_limit` a control step. At a switch, either way, the difference
-    between the r~ last applied and the one now wanted fades out in `transfer_steps` equal parts, so that of the moves
-    of r~ no more than one part is due to the switch.
+    r~ stays within `bounds` and moves by at most `rate_limit` per control step. At a switch, in either direction, the
+    difference between the last applied r~ and the wanted one fades out over `transfer_steps` equal steps.
 
-    What the spec remembers goes on all the time, with the r~ that was applied. For samples that are no numbers, or were
-    skipped, the last ones stand in; what lies outside `y_range` is clipped to it.
+    The spec's memory is always updated, with the r~ that was applied. Samples that are not finite or were skipped are
+    replaced by the last ones; values outside `y_range` are clipped to it.
 
-    Not thread-safe: call it from one thread.
+    Not thread-safe: use it from one thread.
     """
 
     def __init__(
@@ -170,20 +169,20 @@ class Controller:
         record: Callable[[Row], Any] | None = None,
         log_length: int = 1000,
     ) -> None:
-        """Before the first step.
+        """A controller before its first step.
 
         Args:
-            spec: what to do.
+            spec: the control law.
             engaged: whether it controls from the first step, or only after `engage`.
-            r_tilde: the r~ that the plant has now, also after a restart, from which the first step moves on without a
-                bump; None: unknown, and the first r~ is the one wanted.
-            bounds: of r~, within those of the spec; None: those.
-            rate_limit: largest move of r~ a control step, in the spec's `y_unit`.
-            transfer_steps: control steps in which a difference fades out; 1: at once.
-            y_range: where r and y may be; None: where y was in training.
-            late_after: control steps from sample to sample after which one is late.
-            return_after: good samples in a row with which control returns; 1: with the first.
-            clock: gives the time where `step` is given none, in the spec's `time_unit`: `time.monotonic` if that is s.
+            r_tilde: the plant's current r~, also after a restart; the first step then transfers from it without a bump.
+                None: unknown, the first r~ is applied at once.
+            bounds: of r~, within the spec's; None: the spec's.
+            rate_limit: largest move of r~ per control step, in the spec's `y_unit`.
+            transfer_steps: control steps in which the difference at a switch fades out; 1: at once.
+            y_range: valid range of r and y; None: the range of y in training.
+            late_after: a sample is late if more control steps than this have passed since the previous one.
+            return_after: good samples in a row after which control returns; 1: at the first.
+            clock: gives the time if `step` gets none, in the spec's `time_unit`: `time.monotonic` if that is s.
             record: called with the `Row` of each step, such as `csv.writer(file).writerow`.
             log_length: events that `log` keeps.
 
@@ -212,19 +211,19 @@ class Controller:
 
     @classmethod
     def load(cls, path: Path | str, **settings: Any) -> Controller:
-        """The controller in a file that `python -m jaxouter.export --format npz` wrote.
+        """Load a file that `python -m jaxouter.export --format npz` wrote.
 
         Args:
             path: the file.
             **settings: of the controller.
 
         Raises:
-            ValueError: it is no such file, or a setting does not fit.
+            ValueError: it is not such a file, or a setting is wrong.
         """
         return cls(ControllerSpec.load(Path(path)), **settings)
 
     def engage(self) -> None:
-        """Control from the next step on, where nothing speaks against it."""
+        """Control from the next step on, unless there is a reason against it."""
         self._engaged = True
 
     def disengage(self) -> None:
@@ -233,22 +232,22 @@ class Controller:
 
     @property
     def engaged(self) -> bool:
-        """Whether it is to control where nothing speaks against it."""
+        """Whether it is set to control."""
         return self._engaged
 
     @property
     def reason(self) -> Reason | None:
-        """Why the last step passed through; None: it controlled."""
+        """Why the last step passed r through; None: it controlled."""
         return self._reason
 
     @property
     def counts(self) -> dict[Reason, int]:
-        """How many steps passed through, by reason."""
+        """Number of steps that passed r through, by reason."""
         return dict(self._counts)
 
     @property
     def log(self) -> list[Event]:
-        """The last changes, oldest first."""
+        """The last switches, oldest first."""
         return list(self._log)
 
     def step(self, r: float | None, y: float | None, time: float | None = None) -> float:
@@ -278,7 +277,7 @@ class Controller:
         return r_tilde
 
     def _catch_up(self, r: float, y: float) -> None:
-        """The steps that were skipped since the sample before, with that sample."""
+        """Update the memory for skipped steps, with the sample before them."""
         elapsed = self._watch.elapsed
         if elapsed is None or elapsed < 1.5 or self._transfer.r_tilde is None:
             return

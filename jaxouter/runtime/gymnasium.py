@@ -1,12 +1,12 @@
-"""Environments for learners that step through Gymnasium; needs the extra `gymnasium`.
+"""Gymnasium environments; needs the extra `gymnasium`.
 
     import jaxouter.runtime.gymnasium  # registers jaxouter/Pitch-v0 and jaxouter/Heaters-v0
 
     env = gymnasium.make("jaxouter/Pitch-v0", tau=0.5)
     envs = gymnasium.make_vec("jaxouter/Pitch-v0", num_envs=64, tau=0.5)
 
-They are `jaxouter.loop.environment` with NumPy at its edges. Gymnasium has no plug-ins since 1.0: it knows an id after
-this import, or with the module before it, `gymnasium.make("jaxouter.runtime.gymnasium:jaxouter/Pitch-v0")`.
+They wrap `jaxouter.loop.environment` with NumPy in and out. Gymnasium 1.0 has no plug-ins: import this module first,
+or name it in the id, `gymnasium.make("jaxouter.runtime.gymnasium:jaxouter/Pitch-v0")`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ except ImportError as error:
 
 
 def observation_bounds(env: Environment) -> tuple[jax.Array, jax.Array]:
-    """Least and greatest observation while r and y lie within the plant's `divergence_bounds`; each (3 + 2H,).
+    """Least and greatest observation for r and y within the plant's `divergence_bounds`; each (3 + 2H,).
 
-    An episode ends where y leaves them. The leaky integral is a running mean of r - y from 0, so it has its bounds.
+    An episode ends if y leaves them. The leaky integral is a running mean of r - y that starts at 0, so it has the
+    bounds of r - y.
     """
     limits = jnp.asarray(env.plant.divergence_bounds, float)
     r_tilde = jnp.asarray(env.plant.r_tilde_bounds, float)
@@ -48,7 +49,7 @@ def observation_bounds(env: Environment) -> tuple[jax.Array, jax.Array]:
 
 
 def _seen(env: Environment, obs: jax.Array, state: EnvState) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The observation within its bounds, which rounding, sensor noise or a far goal may pass, and info."""
+    """The observation clipped to its bounds, which rounding, sensor noise or a far set-point may exceed; and info."""
     info = {"r": state.r, "y": state.y_seen, "r_tilde": state.memory.r_tilde_past[0]}
     return jnp.clip(obs, *observation_bounds(env)), info
 
@@ -74,7 +75,7 @@ def _step(
 
 @partial(jax.jit, static_argnums=0)
 def _resets(env: Environment, params: EnvParams, seeds: np.ndarray, chosen: np.ndarray, before: Any) -> Any:
-    """New episodes where chosen, (n,) bool; elsewhere what there was before. If that is None, everywhere."""
+    """New episodes for the `chosen` loops, (n,) bool; `before` for the others. If `before` is None, for all."""
     new = jax.vmap(lambda seed: _reset(env, params, seed))(seeds)
     if before is None:
         return new
@@ -87,24 +88,24 @@ def _steps(env: Environment, params: EnvParams, carry: Any, actions: np.ndarray)
 
 
 def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tuple[Environment, EnvParams]:
-    if render_mode is not None:  # stable-baselines3 asks for one, and goes without it on this error alone
+    if render_mode is not None:  # stable-baselines3 asks for one, and only on this error goes on without it
         raise TypeError(f"render_mode is {render_mode!r}; there is nothing to render, so it must be None")
     return make(plant, **settings)
 
 
 def _spaces(env: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Of the observations and of the actions of one loop."""
+    """Observation space and action space of one loop."""
     low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(env))
     return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _draw(generator: np.random.Generator) -> np.uint32:
-    """What an episode's key is made of."""
+    """A seed for an episode's key."""
     return generator.integers(2**32, dtype=np.uint32)
 
 
 def _checked(carry: Any, action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The action, if a step can be made with it."""
+    """The action, after checks that a step is possible."""
     if carry is None:
         raise gymnasium.error.ResetNeeded("step was called before the first reset; call reset first")
     action = np.asarray(action)
@@ -114,20 +115,20 @@ def _checked(carry: Any, action: np.ndarray, shape: tuple[int, ...]) -> np.ndarr
 
 
 def _array(obs: np.ndarray) -> np.ndarray:
-    """A copy that the caller may write to, in the type of the space also under x64."""
+    """A writable copy with the dtype of the space, also under x64."""
     return np.array(obs, np.float32)
 
 
 class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     """The outer loop around one plant: sees r and y, chooses r~.
 
-    - Action, (1,): r~ scaled such that -1 and 1 are its bounds in the plant. Learners of continuous actions explore and
-      saturate on that scale, and Gymnasium's checker asks for it. For r~ in the plant's unit:
+    - Action, (1,): r~ scaled so that -1 and 1 are its bounds. Learners with continuous actions explore and saturate on
+      that scale, and Gymnasium's checker asks for it. For r~ in the plant's unit:
       `gymnasium.wrappers.RescaleAction(env, *np.float32(env.functional.plant.r_tilde_bounds))`.
     - Observation, (3 + 2H,): that of `jaxouter.loop.observation.Observer`, clipped to `observation_bounds`.
-    - End: `terminated` where y diverged, `truncated` at the plant's `episode_steps` (bootstrap there), so it needs no
+    - End: `terminated` if y diverged, `truncated` at the plant's `episode_steps` (bootstrap there), so it needs no
       `gymnasium.wrappers.TimeLimit`. It does not reset itself.
-    - Info: r and y as in the observation, and the r~ that led there, in the plant's unit. The reward is of the true y.
+    - Info: r and y as in the observation, and the r~ before it, in the plant's unit. The reward uses the true y.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
@@ -136,21 +137,21 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     }
 
     functional: Environment
-    """The environment without state."""
+    """The functional environment."""
     params: EnvParams
-    """Its parameters; others of the same structure (sensor noise, say) may take their place, without recompilation."""
+    """Its parameters. They may be replaced by others of the same structure (e.g. sensor noise) without recompiling."""
 
     def __init__(self, plant: str, *, render_mode: str | None = None, **settings: Any) -> None:
         """Nothing is drawn before `reset`.
 
         Args:
             plant: see `jaxouter.plants.make`.
-            render_mode: there is none.
-            **settings: of `jaxouter.make`: history, integral_steps, goal, and parameters of the plant.
+            render_mode: must be None.
+            **settings: for `jaxouter.make`: history, integral_steps, goal, and parameters of the plant.
 
         Raises:
-            ValueError: unknown plant or parameter (lists what exists), or a value that does not fit.
-            TypeError: a render_mode is asked for.
+            ValueError: unknown plant or parameter (lists the known ones), or a wrong value.
+            TypeError: a render_mode is given.
         """
         self.functional, self.params = _made(plant, render_mode, settings)
         self.observation_space, self.action_space = _spaces(self.functional)
@@ -159,11 +160,11 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A new episode: parameters, start and reference are drawn.
+        """Begin an episode: draw parameters, start and reference.
 
         Args:
-            seed: of this and all later episodes; None: go on with the one before.
-            options: there are none.
+            seed: for this and all later episodes; None: continue with the random numbers.
+            options: not used.
 
         Returns:
             obs (3 + 2H,) float32 and info.
@@ -198,11 +199,11 @@ def _floats(info: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many outer loops of one kind, each with a draw of its own, in one compiled call a step.
+    """Many outer loops of one kind, each drawn separately, stepped in one compiled call.
 
-    All that comes out is what `gymnasium.vector.SyncVectorEnv` over as many `OuterLoop` gives in its mode `SAME_STEP`:
-    where an episode ends, the observation is the first of the next one, the last of the old one stands in
-    `infos["final_obs"]` (bootstrap from it unless terminated), and its info in `infos["final_info"]`.
+    Results equal those of `gymnasium.vector.SyncVectorEnv` over as many `OuterLoop` in its mode `SAME_STEP`: when an
+    episode ends, the observation is the first of the next one; the last of the old one is in `infos["final_obs"]`
+    (bootstrap from it unless terminated), and its info in `infos["final_info"]`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
@@ -211,7 +212,7 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     }
 
     functional: Environment
-    """The environment without state, of one loop."""
+    """The functional environment of one loop."""
     params: EnvParams
     """Its parameters, of all loops."""
 
@@ -219,12 +220,12 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         """Nothing is drawn before `reset`.
 
         Args:
-            plant, render_mode, **settings: as `OuterLoop`.
+            plant, render_mode, **settings: as for `OuterLoop`.
             num_envs: n, number of loops.
 
         Raises:
-            ValueError: as `OuterLoop`, or num_envs is below 1.
-            TypeError: a render_mode is asked for.
+            ValueError: as for `OuterLoop`, or num_envs is below 1.
+            TypeError: a render_mode is given.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
@@ -239,17 +240,17 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """New episodes of all loops.
+        """Begin an episode in every loop.
 
         Args:
-            seed: of loop 0, that of loop i is seed + i; or one for each; None: go on with those before.
-            options: there are none.
+            seed: loop i gets seed + i; or one seed per loop; None: continue with the random numbers.
+            options: not used.
 
         Returns:
             obs (n, 3 + 2H) float32 and infos.
 
         Raises:
-            ValueError: there is not a seed for each loop.
+            ValueError: the number of seeds is not that of the loops.
         """
         del options
         seeds = [seed] * self.num_envs if seed is None else seed
@@ -289,7 +290,7 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         return _array(obs), np.array(reward, float), np.array(terminated), np.array(truncated), infos
 
     def _restart(self, chosen: np.ndarray, before: Any) -> Any:
-        """What is seen after new episodes were begun where chosen."""
+        """Observations and infos after starting new episodes in the `chosen` loops."""
         seeds = np.zeros(self.num_envs, np.uint32)
         for i in np.flatnonzero(chosen):
             seeds[i] = _draw(self._generators[i])
@@ -310,7 +311,7 @@ def _infos(info: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, Any]:
 
 
 def _batched(values: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form of infos: beside each value stands who has it."""
+    """Gymnasium's form of infos: each value has a mask that tells which loops have it."""
     return values | {f"_{name}": chosen.copy() for name in values}
 
 

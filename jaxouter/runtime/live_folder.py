@@ -1,4 +1,4 @@
-"""What a real-time loop leaves behind: its declaration, its state, a row a control step, a summary."""
+"""The folder of a real-time loop: its declaration, its state, one row per control step, a summary."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import lock, open_run, write_json
 
 FORMAT = 1
-EPISODES = 64  # of a family of references, after which they come again
-PARTS = {"first quarter": slice(0, 1), "last quarter": slice(3, 4)}  # of four
+EPISODES = 64  # random references of a family, which then repeat
+PARTS = {"first quarter": slice(0, 1), "last quarter": slice(3, 4)}  # quarters of the rows
 SIGNALS = ("y", "y_passed", "y_kept", "y_learned")
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a live folder is about; a trained run says the rest itself."""
+    """Settings of a live folder; a trained run knows the rest."""
 
     dt: float
     """Period, s."""
     seed: int = 0
-    """Of networks, exploration and references."""
+    """Seed of networks, exploration and references."""
     episode_steps: int = 400
-    """Control steps of a reference."""
+    """Control steps of one random reference."""
     takeover: int = 2_000
-    """Updates before what is learned may act."""
+    """Updates before the learned policy may act."""
     r_tilde_bounds: tuple[float, float] | None = None
-    """From nothing: least and greatest r~ that the loop may be shown."""
+    """Without a trained run: least and greatest r~ that the plant may get."""
     setpoint_range: tuple[float, float] | None = None
-    """From nothing: between what r lies, as a rule; scales what is seen, and random references."""
+    """Without a trained run: usual range of r; scales the observation and random references."""
 
     def check(self) -> None:
-        """Raises ValueError, naming option, value and what is allowed."""
+        """Raises ValueError if an option is wrong; names the option, its value and what is allowed."""
         if not 0.0 < self.dt < math.inf:
             raise ValueError(f"--dt is {self.dt}; it must be a positive number of seconds")
         for name in ("episode_steps", "takeover"):
@@ -68,49 +68,49 @@ class LiveFolder:
 
     @property
     def path(self) -> Path:
-        """Where everything is written."""
+        """The folder that everything is written to."""
         return self.run / "live"
 
     @property
     def trained(self) -> bool:
-        """Whether there is a run around it."""
+        """Whether it belongs to a trained run."""
         return is_run(self.run)
 
     @property
     def state_file(self) -> Path:
-        """The state, of which it goes on."""
+        """The saved state, from which the loop resumes."""
         return self.path / "state.npz"
 
     @property
     def rows_file(self) -> Path:
-        """A row a control step."""
+        """One row per control step."""
         return self.path / "steps.csv"
 
     def begin(self) -> tuple[Live, LiveState]:
-        """What acts and learns, from where it was left, from what the run has learned, or from nothing.
+        """The policy and learner: resumed, or from the trained run, or new.
 
         Raises:
-            ValueError: the run, or the state, is not readable; or the ranges are none.
+            ValueError: the run or the state is not readable, or a range is wrong.
         """
-        said, key = self.declaration, jax.random.key(self.declaration.seed)
+        own, key = self.declaration, jax.random.key(self.declaration.seed)
         if self.trained:
             run, seed, _ = open_run(self.run)
             trainer, _ = run.trainer
             learned, _ = run.load(seed)
-            live = Live.of(trainer.config, trainer.env, said.takeover, "trained")
+            live = Live.of(trainer.config, trainer.env, own.takeover, "trained")
             state = live.trained(key, learned, trainer.agent.actor(learned.agent))
         else:
-            options = PlantOptions(r_tilde_bounds=said.r_tilde_bounds, setpoint_range=said.setpoint_range)
-            live = Live.of(*declared(said.dt, said.episode_steps, options), said.takeover, "static")
+            options = PlantOptions(r_tilde_bounds=own.r_tilde_bounds, setpoint_range=own.setpoint_range)
+            live = Live.of(*declared(own.dt, own.episode_steps, options), own.takeover, "static")
             state = live.fresh(key)
         return live, checkpoint.load(self.state_file, state)[0] if self.state_file.exists() else state
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """The folder, made where it is not there, for this process alone.
+        """Make the folder if needed, and lock it for this process.
 
         Raises:
-            ValueError: it can't be made, or another process has it.
+            ValueError: it can't be made, or another process has locked it.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -122,7 +122,7 @@ class LiveFolder:
 
     @contextmanager
     def rows(self) -> Iterator[Any]:
-        """Writer of rows, each there as soon as it is written."""
+        """Writer of rows; each is flushed at once."""
         before = self.rows_file.read_bytes()[-1:] if self.rows_file.exists() else b""
         with self.rows_file.open("a", newline="", buffering=1) as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -133,7 +133,7 @@ class LiveFolder:
             yield writer
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All rows, by column; nan where there is none."""
+        """All rows, by column; nan for missing values."""
         if not self.rows_file.exists():
             return {}
         with self.rows_file.open(newline="") as file:
@@ -146,10 +146,10 @@ class LiveFolder:
         }
 
     def save(self, loop: Loop) -> None:
-        """State, and the controller that acts.
+        """Save the state, and the controller that acts now.
 
         Raises:
-            OSError: they can't be written; what was there is whole.
+            OSError: they can't be written; the previous files are intact.
         """
         state = loop.state
         checkpoint.save(self.state_file, state)
@@ -161,30 +161,28 @@ class LiveFolder:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the folder is a run, or a seed of one."""
+    """Whether the folder is a run, or the folder of one of its seeds."""
     return (path / "config.json").exists() or (path.name.startswith("seed-") and (path / "../config.json").exists())
 
 
 def open_folder(run: Path, given: Declaration, learn: bool) -> LiveFolder:
-    """The live folder of a run, whose declaration must be what it was.
+    """The live folder of a run; its declaration must not have changed.
 
     Raises:
-        ValueError: the declaration is another one, or there is nothing that acts and it is not to learn.
+        ValueError: the declaration has changed, or there is no policy to run and `learn` is False.
     """
     given.check()
     folder, file = LiveFolder(run, given), run / "live" / "config.json"
     if folder.trained:
         if given.r_tilde_bounds or given.setpoint_range:
-            raise ValueError(f"{run} says itself between what r~ and set-points lie; leave these options away")
+            raise ValueError(f"{run} already has ranges of r~ and set-points; leave out these two options")
     elif not file.exists():
         if run.exists() and (not run.is_dir() or any(run.iterdir())):
             raise ValueError(f"{run} is not a run folder: it has no readable config.json")
         if not learn:
-            raise ValueError(f"there is no run {run}; train one, or begin one from nothing by --learn")
+            raise ValueError(f"there is no run {run}; train one, or start without one by --learn")
         if given.r_tilde_bounds is None or given.setpoint_range is None:
-            raise ValueError(
-                "a loop of which nothing is known takes --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH"
-            )
+            raise ValueError("a loop without a trained run needs --r-tilde-bounds LOW HIGH --setpoint-range LOW HIGH")
     if not file.exists():
         return folder
     was = _read(file)
@@ -205,10 +203,10 @@ def _read(path: Path) -> Declaration:
 
 
 def reference(text: str, setpoint_range: tuple[float, float], steps: int, seed: int) -> np.ndarray:
-    """A cycle of references: a number, the column r of a CSV file, or a family, 64 times drawn.
+    """A cycle of references: a number, the column r of a CSV file, or 64 random references of a family.
 
     Raises:
-        ValueError: it is none of them.
+        ValueError: `text` is none of these.
     """
     if text in FAMILIES:
         keys = jax.random.split(jax.random.key(seed), EPISODES)
@@ -236,10 +234,10 @@ def _column(path: Path) -> np.ndarray:
 
 
 def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What the loop has come to, after a step at least.
+    """Results of the loop so far; needs at least one step.
 
-    MAE is of what came, and of what the record tells of the others on the same steps; `act_us` and `sent_back` are
-    since the start of this process.
+    The MAE is given for the loop itself and, on the same steps, for the compared policies as predicted from the record.
+    `act_us` and `sent_back` are since the start of this process.
     """
     p50, p99 = np.percentile(1e6 * np.asarray(loop.act_seconds), (50, 99)).tolist()
     slope, offset = (float(value) for value in loop.state.base)
@@ -257,7 +255,7 @@ def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def maes(columns: Mapping[str, np.ndarray], quarters: slice) -> dict[str, float | None]:
-    """Mean of |r_k - y_(k+1)| over some quarters of the rows; None where that is not known for half of them."""
+    """Mean of |r_k - y_(k+1)| over some quarters of the rows; None if it is not known for half of them."""
     edges = [i * max(0, len(columns["r"]) - 1) // 4 for i in range(5)]
     k = np.arange(edges[quarters.start], edges[quarters.stop])
     follows = k[columns["step"][k + 1] == columns["step"][k] + 1]

@@ -1,12 +1,12 @@
-"""What acts and learns in a real-time loop: pure functions of parts of one state, jitted.
+"""Policy and learner of a real-time loop: pure, jitted functions of one state.
 
-From nothing r passes through while a record is made; then the static inverse of that record acts, and then what was
-learned on top of it. A trained policy acts as it is, and then what was learned since. `jaxouter.runtime.realtime` is
-the loop in time.
+Without a trained policy, r passes through while a record is made. Then the static inverse identified from the record
+acts, and later the policy learned on top of it. A trained policy acts unchanged at first, and later what it has learned
+since. `jaxouter.runtime.realtime` is the loop in time.
 
 Once the response of y to a change of r~ is known, each step is replayed under other r~
-(`jaxouter.identification.counterfactual`), at no cost to the plant. Three of these replays tell what passing r through,
-the fallback and the learned policy would have achieved; the rest explore.
+(`jaxouter.identification.counterfactual`), at no cost to the plant. Three of these replays predict what passing r
+through, the fallback and the learned policy would have achieved; the rest explore.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ Stage = Literal["recording", "learned"] | Kept
 Why = Stage | Reason
 WHYS: tuple[Why, ...] = ("recording", "static", "trained", "learned", "late", "missing", "not finite", "out of range")
 NAME = "live"
-FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y comes to r~ at once
-HISTORY = 8  # where nothing else is known
-COMPARED = 3  # of the others: r passes through; the policy that was kept; what was learned, without exploration
-EXPLORING = 12  # of the others
-SIGMA, THETA = (0.0125, 0.1), 0.15  # exploration of the loop itself, and of the last replay: as in `ornstein_uhlenbeck`
-REDRAW = 0.02  # probability that one of these gets another set-point at a step
+FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y = r~ at once
+HISTORY = 8  # past samples in the observation of an unknown plant
+COMPARED = 3  # counterfactuals that are compared: r passed through, the fallback, the learned policy (no exploration)
+EXPLORING = 12  # counterfactuals that explore
+SIGMA, THETA = (0.0125, 0.1), 0.15  # Ornstein-Uhlenbeck noise; sigma of the loop itself and of the last counterfactual
+REDRAW = 0.02  # probability per step that an exploring counterfactual gets a new set-point
 KEPT = 20_000  # control steps in the replay
-RECENT = 2_000  # of them, from which the response is identified
-AGREE = 0.2  # by which the gains of both halves of the record may differ, as share of that of the whole
+RECENT = 2_000  # newest of them, from which the response is identified
+AGREE = 0.2  # largest difference between the gains of both halves of the record, as share of the whole record's gain
 
 
 class Sample(NamedTuple):
-    """What came at t_k and what was answered; scalars but for the memory."""
+    """One control step: r and y as measured, and the r~ chosen. Scalars, except for the memory."""
 
-    memory: Memory  # e_k integrated
+    memory: Memory  # with e_k already integrated
     r: jax.Array
     y: jax.Array
     r_tilde: jax.Array
@@ -67,63 +67,63 @@ class Sample(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Of y to a change of r~: dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i); zero while it is not known."""
+    """Response of y to a change of r~: dy_(k+1) = sum_i a_i dy_(k-i) + b_i dr~_(k-i); zero until identified."""
 
     a: jax.Array  # (H,)
     b: jax.Array  # (H,)
 
 
 class Others(NamedTuple):
-    """Who lives the same steps under another r~; each leaf (O, ...)."""
+    """Counterfactuals: the same steps under other r~; each leaf (O, ...)."""
 
     sample: Sample
-    dy: jax.Array  # (O, H), differences to what came, the newest first
+    dy: jax.Array  # (O, H), differences to the measured y, newest first
     dr_tilde: jax.Array  # (O, H)
-    noise: jax.Array  # (O,), exploration
+    noise: jax.Array  # (O,), exploration noise
 
 
 class LiveState(NamedTuple):
-    """Everything that a live loop changes."""
+    """State of a live loop."""
 
     agent: Any
     replay: ReplayState
     base: AffineParams  # r~ of a zero action
-    kept: Any  # actor from the beginning, to fall back on; of zeros it is the static inverse
-    begun: jax.Array  # bool, whether the base is more than r~ = r
-    leads: jax.Array  # bool, whether what was learned acts
+    kept: Any  # fallback actor, from the start; if it is zero, the fallback is the static inverse
+    begun: jax.Array  # bool, whether a base law is known (else r~ = r)
+    leads: jax.Array  # bool, whether the learned policy acts
     response: Response
-    sample: Sample  # the last one
+    sample: Sample  # of the last step
     others: Others
-    noise: jax.Array  # exploration, 1 is half the range of r~
+    noise: jax.Array  # exploration noise; 1 is half the range of r~
     key: chex.PRNGKey
     updates: jax.Array  # int32, of the agent
-    counts: jax.Array  # (len(WHYS),), int32, control steps by what decided them
+    counts: jax.Array  # (len(WHYS),), int32, control steps by what decided r~
 
 
 @dataclass(frozen=True)
 class Live:
-    """What acts and learns. Static and hashable."""
+    """Policy and learner. Static and hashable."""
 
-    env: Environment  # which nobody steps
+    env: Environment  # declares the plant; never stepped
     policy: LearnedPolicy
     agent: OffPolicyAgent
     data: OffPolicy
     reward_scale: float
     replay: Replay
     takeover: int
-    """Updates before what was learned acts."""
+    """Updates before the learned policy may act."""
     kept: Kept
-    """What acts before it."""
+    """The fallback, which acts before that."""
 
     @classmethod
     def of(cls, config: TrainConfig, env: Environment, takeover: int, kept: Kept) -> Live:
-        """For the configuration and the environment of a run, or of `declared`.
+        """From the configuration and environment of a run, or from `declared`.
 
         Args:
-            config, env: agent and observation. One that learns on-policy is followed by the default off-policy agent,
-                with the actor that it has learned.
-            takeover: updates before what was learned acts; for half of them the actor stays as it is.
-            kept: what acts before it.
+            config, env: agent and observation. An on-policy agent is replaced by the default off-policy one, which
+                takes over its actor.
+            takeover: updates before the learned policy may act; the actor is frozen for the first half of them.
+            kept: the fallback, which acts before that.
         """
         chosen = config.agent
         if not isinstance(chosen.data, OffPolicy):
@@ -136,12 +136,12 @@ class Live:
 
     @property
     def observer(self) -> Observer:
-        """What is seen."""
+        """The observer."""
         return self.env.observer
 
     @partial(jax.jit, static_argnums=0)
     def fresh(self, key: chex.PRNGKey) -> LiveState:
-        """Nothing is known: r~ = r."""
+        """Initial state without a trained run: r~ = r."""
         key, key_agent = jax.random.split(key)
         zero, middle = jnp.zeros(()), jnp.asarray(self.observer.y_middle, float)
         sample, agent = self.first(middle, middle), self.agent.init(key_agent)
@@ -162,28 +162,30 @@ class Live:
         )
 
     def trained(self, key: chex.PRNGKey, state: TrainState, actor: Any) -> LiveState:
-        """Begin with what a run has learned; its optimisers and targets begin anew."""
+        """Initial state from a trained run, with fresh optimisers and targets."""
         fresh = self.fresh(key)
         if jax.tree.structure(state.agent) == jax.tree.structure(fresh.agent):
             agent = self.agent.restarted(state.agent)
-        else:  # of a learner that can't go on here
+        else:  # another kind of learner: take its actor alone
             agent = self.agent.with_actor(fresh.agent, actor)
-        kept = jax.tree.map(jnp.copy, self.agent.actor(agent))  # the agent is donated, and no buffer twice
+        kept = jax.tree.map(
+            jnp.copy, self.agent.actor(agent)
+        )  # a copy: the agent is donated, and no buffer may be twice
         return fresh._replace(agent=agent, kept=kept, base=state.base, begun=jnp.ones((), bool))
 
     def stage(self, state: LiveState) -> Stage:
-        """What decides where nothing is wrong."""
+        """What decides r~ if nothing is wrong."""
         return "learned" if state.leads else self.kept if state.begun else "recording"
 
     @partial(jax.jit, static_argnums=0)
     def first(self, r: jax.Array, y: jax.Array) -> Sample:
-        """What stands before the first sample: the loop at rest at y."""
+        """The step before the first sample: the loop at rest at y."""
         r_tilde = jnp.clip(y, *self.observer.r_tilde_bounds)
         return Sample(self.observer.init(r, y), r, y, r_tilde, jnp.full((), -1, jnp.int32))
 
     @partial(jax.jit, static_argnums=0)
     def gathered(self, sample: Sample) -> Others:
-        """The others, each where the loop is."""
+        """Counterfactuals that start from the loop's current step."""
         n, history = COMPARED + EXPLORING, self.observer.history
         samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), sample)
         samples = samples._replace(age=jnp.full_like(samples.age, -1))
@@ -193,7 +195,7 @@ class Live:
     def act(
         self, actors: tuple[Any, Any], base: AffineParams, before: Sample, explore: Any, r: jax.Array, y: jax.Array
     ) -> tuple[Memory, jax.Array]:
-        """At t_k: the memory, and r~ of both actors, the kept and the learned one, with exploration; (2,)."""
+        """At t_k: the memory, and r~ (2,) of the fallback and the learned actor, both with `explore` added."""
         memory = self.observer.record(before.memory, before.y, before.r_tilde)
         memory, obs = self.observer.observe(memory, r, y)
         actions = jnp.stack([self.policy.action(actor, obs) for actor in actors])
@@ -204,17 +206,17 @@ class Live:
     def relive(
         self, state: LiveState, actor: Any, now: Sample, step: jax.Array
     ) -> tuple[Others, jax.Array, jax.Array, jax.Array]:
-        """What t_k is to the loop and to the others.
+        """Advance the counterfactuals to t_k.
 
         Args:
-            state: before t_k; its agent and replay are not looked at.
-            actor: of the others.
-            now: the sample of t_k.
+            state: before t_k; its agent and replay are not used.
+            actor: of the counterfactuals.
+            now: the loop's step t_k.
             step: k, uint32.
 
         Returns:
-            The others; the loop's next exploration noise; rows (E, width) for the replay, of the step up to t_k; and y
-            (3,) of those that are compared. While the response is not known, each row is that of the loop.
+            The counterfactuals; the loop's next exploration noise; rows (E, width) for the replay, of the step up to
+            t_k; and y (3,) of the compared ones. Until the response is known, each row is the loop's.
         """
         key_noise, key_when, key_r = jax.random.split(jax.random.fold_in(state.key, step), 3)
         (low, high), n = self.env.plant.setpoint_range, COMPARED + EXPLORING
@@ -245,7 +247,7 @@ class Live:
         return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED]
 
     def row(self, base: AffineParams, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
-        """The replay's row of the step from the sample before to r and y; (width,)."""
+        """The replay's row for the step from sample `before` to r and y; (width,)."""
         signals = Signals(
             r=before.r,
             y=before.y,
@@ -261,18 +263,18 @@ class Live:
         return jnp.stack([*signals, action, self.reward_scale * reward, never, never])
 
     def _action(self, base: AffineParams, r: jax.Array, r_tilde: jax.Array) -> jax.Array:
-        """The action of which r~ comes; beyond [-1, 1] where r passed through."""
+        """The action that gives r~; it may lie beyond [-1, 1] if r passed through."""
         low, high = self.observer.r_tilde_bounds
         return (r_tilde - base.offset - base.slope * r) / ((high - low) / 2)
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def write(self, replay: ReplayState, rows: jax.Array) -> ReplayState:
-        """The replay with one row more of each."""
+        """The replay with one more row for the loop and each counterfactual."""
         return self.replay.write(replay, rows)
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def relabelled(self, replay: ReplayState, base: AffineParams) -> ReplayState:
-        """The replay with its actions in terms of another base."""
+        """The replay with its actions recomputed for another base law."""
         rows, places = replay.rows, [FIELDS.index(name) for name in ("r", "r_tilde", "action")]
         r, r_tilde = (rows[..., place].astype(base.slope.dtype) for place in places[:2])
         action = self._action(base, r, r_tilde).astype(rows.dtype)
@@ -280,17 +282,17 @@ class Live:
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update(self, agent: Any, replay: ReplayState, key: chex.PRNGKey, number: jax.Array) -> Any:
-        """Update number so and so, uint32, from the replay."""
+        """Update `number` (uint32) of the agent, from the replay."""
         key_batch, key_update = jax.random.split(jax.random.fold_in(key, number))
         bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
         transitions = batch(self.replay, self.observer, self.data.discount, replay, bits)
         return self.agent.update(agent, transitions, key_update)[0]
 
     def identify(self, replay: ReplayState) -> tuple[AffineParams, Response]:
-        """By a linear model of the last steps: the static inverse, r~ = (r - offset) / gain, and the response.
+        """Identify the static inverse, r~ = (r - offset) / gain, and the response, by a linear model of recent steps.
 
         Raises:
-            ValueError: they do not tell it.
+            ValueError: the record is not informative enough; says why.
         """
         data = self._record(replay)
         half, least = len(data.y) // 2, 4 * data.y.shape[1]
@@ -301,15 +303,17 @@ class Live:
         whole, *halves = (_model(Record(*(x[part] for x in data))) for part in (slice(None), *_halves(half)))
         gains = [linear_models.gain(model) for model in (whole, *halves)]
         if linear_models.radius(whole) >= 1.0 or not np.ptp(gains) <= AGREE * abs(gains[0]):
-            told = ", ".join(f"{each:.3g}" for each in gains)
-            raise ValueError(f"the record does not tell the DC gain: it is {told} by all of it and by both halves")
+            of_all, first, last = (f"{each:.3g}" for each in gains)
+            raise ValueError(
+                f"the DC gain is uncertain: {of_all} from the whole record, {first} and {last} from its halves"
+            )
         dtype = jnp.result_type(float)
         found = (1.0 / gains[0], -linear_models.offset(whole) / gains[0], whole.a, whole.b)
-        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # so nothing is compiled
+        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # this way nothing is compiled
         return AffineParams(slope, offset), Response(a, b)
 
     def _record(self, replay: ReplayState) -> Record:
-        """Windows of H steps of the loop without interruption, each with the y after it."""
+        """Windows of H uninterrupted steps of the loop, each with the y after it."""
         layout, written = self.replay, int(replay.written)
         recent = np.arange(max(0, written - min(RECENT, layout.steps - layout.mirror)), written)
         rows = np.asarray(replay.rows)[0, recent % layout.steps + layout.mirror].astype(np.float64)
@@ -329,13 +333,13 @@ def _model(data: Record) -> Model:
 
 
 def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[TrainConfig, Environment]:
-    """Learner and declaration of a loop of which nothing is known but its ranges.
+    """Learner and environment for an unknown plant, from its ranges alone.
 
     Raises:
-        ValueError: the ranges are none.
+        ValueError: a range is wrong.
     """
-    said = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
-    said |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # each move of r~ has its price
-    plant, _ = arx.make(FOLLOWS, [FOLLOWS], **said)
+    fields = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
+    fields |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # every move of r~ is charged
+    plant, _ = arx.make(FOLLOWS, [FOLLOWS], **fields)
     observer = Observer.of(plant)
     return configured(NAME, "live", LIVE), Environment(plant, observer, SetPoint(*plant.setpoint_range))

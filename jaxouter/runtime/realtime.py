@@ -1,4 +1,4 @@
-"""A real-time loop around a bare function `step(r_tilde) -> y`: clock, deadlines, and what stands against control."""
+"""A real-time loop around a function `step(r_tilde) -> y`: clock, deadlines, faults, and the choice of policy."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ import numpy as np
 from jaxouter.runtime.controller import Transfer, Watch
 from jaxouter.runtime.online import WHYS, Live, LiveState, Sample, Stage, Why
 
-RESERVE = 0.1  # of a period, which updates leave alone
-FORGET = 0.9  # of what an update was last seen to take at most
-NAP = 0.2  # s, longest sleep before looking whether to stop
+RESERVE = 0.1  # share of a period kept free of updates
+FORGET = 0.9  # decay per update of the longest update time seen
+NAP = 0.2  # s, longest sleep before `stop` is asked again
 LATELY = 200  # control steps, time constant of the mean errors that are compared
-CAME, KEPT, LEARNED = 0, 2, 3  # of the errors
-BETTER = 0.9  # errors as large as those of the policy that was kept let what was learned take over
-WORSE, SLACK = 1.25, 0.02  # as large, and so much of half the set-point range more: they send it back
+CAME, KEPT, LEARNED = 0, 2, 3  # index in the errors: the loop itself, the fallback, the learned policy
+BETTER = 0.9  # the learned policy takes over once its error is below 0.9 times the fallback's
+WORSE, SLACK = 1.25, 0.02  # it is sent back above 1.25 times the fallback's error plus 0.02 of half the set-point range
 
 
 class StepError(Exception):
-    """The user's function failed, or gave no number."""
+    """The user's function failed, or did not return a number."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How the loop runs."""
+    """Settings of the loop."""
 
     dt: float
     """Period, s."""
     learn: bool = False
     record: int = 500
-    """Control steps before the response is identified, and the static inverse."""
+    """Control steps before the response and the static inverse are identified."""
     most_updates: int = 8
-    """Updates a period, at most."""
+    """Most updates per period."""
     transfer_steps: int = 10
-    """Control steps in which r~ goes from one stage to the next."""
+    """Control steps in which r~ moves from one policy's to the next one's."""
 
 
 class Row(NamedTuple):
-    """A control step, as it came and as it was answered."""
+    """One control step: r and y as measured, the r~ applied, and what the compared policies would have given."""
 
     step: int
     time: float  # s, when it was due
@@ -55,21 +55,20 @@ class Row(NamedTuple):
     y: float | None
     r_tilde: float
     why: Why
-    y_passed: float | None  # y, had r passed all the time, as far as the record tells
-    y_kept: float | None  # y, had the static inverse acted, or the trained policy as it was
-    y_learned: float | None  # y, had what is learned so far acted
+    y_passed: float | None  # predicted y if r had passed through all the time
+    y_kept: float | None  # predicted y if the fallback had acted
+    y_learned: float | None  # predicted y if the learned policy had acted
 
 
 class Loop:
-    """A loop in time: `step` once a period, `learn` with what is left of it.
+    """The loop in time: call `step` once per period, and `learn` in the rest of it.
 
-    A deadline is missed where r~ is not chosen within the period. Then, and where y is no number or out of range, r
-    passes for that step; what was learned takes over with the next one. The grid of periods is kept: what came too late
-    for a whole period is skipped.
+    If r~ is not chosen within the period (a missed deadline), or y is not finite or out of range, r passes through for
+    that step; the policy acts again at the next one. The grid of periods is kept: whole periods that were missed are
+    skipped.
 
-    What was learned takes over where |r - y| would have been less than under the policy that was kept lately, as far as
-    the record tells that. Where it turns out worse, the one that was kept is back, for as many updates as in the
-    beginning.
+    The learned policy takes over once its predicted recent |r - y| is below the fallback's. If it turns out worse, the
+    fallback returns, for as many updates as at the start.
     """
 
     def __init__(
@@ -82,23 +81,23 @@ class Loop:
         begin: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Compiles all that it will call.
+        """Compiles everything that it will call.
 
         Args:
-            live, state: what acts and learns.
-            plant: applies r~, and gives y as it is then measured; None: it did not come.
-            reference: r of a control step.
-            settings: how it runs.
+            live, state: policy and learner.
+            plant: applies r~, and returns the y measured then; None: it is missing.
+            reference: gives r of a control step.
+            settings: of the loop.
             begin: time of the first row, s.
-            clock: s.
+            clock: gives the time, s.
 
         Raises:
             ValueError: an update takes longer than a period.
         """
         self.live, self.settings = live, settings
         self.act_seconds = array("f")
-        self.sent_back = 0  # times that what was learned turned out worse
-        self.trouble: str | None = None  # why there is no static inverse yet
+        self.sent_back = 0  # times that the learned policy turned out worse
+        self.trouble: str | None = None  # why the response is not identified yet
         self._state = state if settings.learn else state._replace(noise=jnp.zeros_like(state.noise))
         self._plant, self._reference, self._clock = plant, reference, clock
         self._counts = dict(zip(WHYS, np.asarray(state.counts).tolist(), strict=True))
@@ -107,20 +106,20 @@ class Loop:
         self._r_tilde = self._clip(reference(self.steps))
         self._watch = Watch(self._r_tilde, self._r_tilde, live.env.plant.divergence_bounds, settings.dt, math.inf, 1)
         self._transfer = self._from_here()
-        self._met = self._unbroken = False  # whether there was a y yet; whether the step before may be learned from
+        self._met = self._unbroken = False  # whether there was a y yet; whether the previous step was without fault
         self._written = int(state.replay.written)
         self._updates = int(state.updates)
         self._identify_at = settings.record
         self._takeover_at = live.takeover
         self._known = bool(np.any(state.response.b))
-        self._errors = np.zeros(4)  # lately, of what came and of the others that are compared
+        self._errors = np.zeros(4)  # recent mean errors of the loop and of the compared policies
         self._compile()
         self._fastest = self._longest = self._update_takes() if settings.learn else 0.0
         self._begin, self._period = begin, 0
         self.start()
 
     def start(self) -> None:
-        """The next step is due now."""
+        """Make the next step due now."""
         self._origin = self._clock() - self._period * self.settings.dt
 
     @property
@@ -130,7 +129,7 @@ class Loop:
 
     @property
     def counts(self) -> dict[Why, int]:
-        """Control steps by what decided them."""
+        """Control steps by what decided r~."""
         return dict(self._counts)
 
     @property
@@ -140,18 +139,18 @@ class Loop:
 
     @property
     def stage(self) -> Stage:
-        """What decides where nothing is wrong."""
+        """What decides r~ if nothing is wrong."""
         return self._stage
 
     @property
     def state(self) -> LiveState:
-        """All that has changed."""
+        """The current state."""
         counts, updates = (jnp.asarray(x, jnp.int32) for x in (list(self._counts.values()), self._updates))
         return self._state._replace(counts=counts, updates=updates)
 
     @property
     def left(self) -> float:
-        """Seconds until the next step is due; negative: it is."""
+        """Seconds until the next step is due; negative if overdue."""
         return self._origin + self._period * self.settings.dt - self._clock()
 
     def step(self) -> Row:
@@ -218,10 +217,10 @@ class Loop:
         try:
             return None if y is None else float(y)
         except (TypeError, ValueError):
-            raise StepError(f"it gave {y!r}; it must give a number, or None where there is none") from None
+            raise StepError(f"it returned {y!r}; it must return a number, or None if there is none") from None
 
     def _apply(self, wanted: float, controls: bool) -> None:
-        """R passes at once, and control is back at once; between stages the difference fades out."""
+        """A fault, and its end, switch at once; between policies the difference fades out."""
         if controls:
             self._r_tilde = self._transfer.apply(wanted, True)
         else:
@@ -240,7 +239,7 @@ class Loop:
         self._state = self._state._replace(leads=jax.device_put(np.bool_(stage == "learned")))
 
     def _note(self, before: Sample, memory: Any, r: Any, y: Any, fine: bool) -> Sequence[float | None]:
-        """The step becomes past, and what came of the one before is kept; y of the others."""
+        """Record the step in state and replay; returns the predicted y of the compared policies."""
         state, follows = self._state._replace(sample=before), fine and self._unbroken
         age: Any = np.int32(before.age + 1 if follows else 0)
         now = Sample(memory, r, y, self._float(self._r_tilde), age)
@@ -264,7 +263,7 @@ class Loop:
         return found.tolist()
 
     def _compare(self, r: float, y: np.ndarray) -> None:
-        """Send what was learned back where it has been worse than what was kept."""
+        """Return to the fallback if the learned policy has been worse."""
         self._errors += (np.abs(r - y) - self._errors) / LATELY
         bound = WORSE * self._errors[KEPT] + SLACK * self.live.observer.y_scale
         if self._stage == "learned" and self._errors[CAME] > bound:
@@ -273,7 +272,7 @@ class Loop:
             self._enter(self.live.kept)
 
     def _identify(self) -> None:
-        """The response, and where r has passed so far the static inverse."""
+        """Identify the response, and the static inverse if r has passed through so far."""
         try:
             base, response = self.live.identify(self._state.replay)
         except ValueError as error:
@@ -288,7 +287,7 @@ class Loop:
             self._enter(self.live.kept)
 
     def _compile(self) -> None:
-        """On copies: what learns gives its buffers away."""
+        """Compile on copies, as the learner's buffers are donated."""
         live, state = self.live, self._state
         r = y = self._float(live.observer.y_middle)
         sample = live.first(r, y)
@@ -301,7 +300,7 @@ class Loop:
             live.relabelled(live.write(jax.tree.map(jnp.copy, state.replay), rows), state.base)
 
     def _update_takes(self) -> float:
-        """The least of some, s."""
+        """The fastest of some updates, s."""
         agent, took = jax.tree.map(jnp.copy, self._state.agent), []
         for _ in range(10):
             begun = self._clock()
@@ -323,14 +322,14 @@ def run(
     report: Callable[[Row], None] = lambda row: None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Go on for so many control steps, or until it is to stop.
+    """Run for some control steps, or until told to stop.
 
     Args:
-        loop: what runs.
-        steps: None: no end.
-        stop: asked before each step, and while it waits.
-        report: called with each row, after r~ was chosen.
-        sleep: s.
+        loop: the loop.
+        steps: how many; None: no end.
+        stop: asked before each step and while waiting.
+        report: called with each row after r~ is applied.
+        sleep: sleeps for so many seconds.
 
     Raises:
         StepError: the plant failed.
@@ -349,7 +348,7 @@ def run(
 
 @contextmanager
 def _no_garbage() -> Iterator[None]:
-    """What there is already is not searched for garbage: that takes longer than a period."""
+    """Exempt existing objects from garbage collection, which would take longer than a period."""
     gc.collect()
     gc.freeze()
     try:

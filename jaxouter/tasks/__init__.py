@@ -1,4 +1,4 @@
-"""Tasks: what is declared of each plant. A new one is one file, and one line in `TASKS`; or a file of one's own."""
+"""Tasks: a plant with its presets, scenarios and sweeps. A new task is one file and one line in `TASKS`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ TASKS: dict[str, Task] = {"pitch": PITCH, "heaters": HEATERS}
 
 
 def of(plant: str) -> Task:
-    """The task of a plant: that which is declared, or a bare one around its maker.
+    """The task of a plant: the declared one, or an empty one around its maker.
 
     Raises:
-        ValueError: there is no such plant; lists those that exist.
+        ValueError: there is no such plant; lists the plants.
     """
     maker = plants.resolve(plant)
     if plant in TASKS:
@@ -29,7 +29,7 @@ def of(plant: str) -> Task:
 
 
 def presets(plant: str) -> list[str]:
-    """Names of a plant's presets."""
+    """Names of the plant's presets."""
     return list(dict.fromkeys([*of(plant).presets, *PRESETS]))
 
 
@@ -37,7 +37,7 @@ def options(plant: str, preset: str) -> Options:
     """The options of a preset.
 
     Raises:
-        ValueError: unknown plant or preset; lists those that exist.
+        ValueError: unknown plant or preset; lists the known ones.
     """
     if preset not in presets(plant):
         raise ValueError(f"there is no preset {preset!r} for {plant}; the presets are: {', '.join(presets(plant))}")

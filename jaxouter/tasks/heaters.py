@@ -31,7 +31,7 @@ ROBUST = {
         ("x_out", -20.0, 5.0),
         ("Ca", 7.0, 13.0),
         ("Ua", 0.14, 0.26),
-        ("sigma", 0.0, 0.3),  # of four houses: the noise of their mean is that of any number of them
+        ("sigma", 0.0, 0.3),  # for four houses; this range also covers the mean's noise of any larger number
     ),
     "pretraining.gradient_steps": 5_000,
     "pretraining.episodes": 1_024,
@@ -40,7 +40,7 @@ ROBUST = {
 
 
 def _mixed_stock(params: Any) -> Any:
-    """Ca and Ua uniform within 30 % from house to house, another stock in each episode."""
+    """Ca and Ua of each house uniform within 30 %, drawn anew for each episode."""
     shape, house = params.weights.shape, params.house
     key_Ca, key_Ua = jax.random.split(jax.random.key(1))
     house = house.replace(
@@ -51,13 +51,13 @@ def _mixed_stock(params: Any) -> Any:
 
 
 def _own_start(params: Any, key: jax.Array, episodes: int) -> Any:
-    """A mean temperature at the start of its own for each episode."""
+    """A random mean temperature at the start of each episode."""
     low, high = heaters.HEATERS.setpoint_range
     return params.replace(x0_mean=jax.random.uniform(key, (episodes,), float, low, high))
 
 
 def _houses(params: Any, repeats: int, houses: jax.Array) -> Any:
-    """So many houses count; the others, there for one shape to serve all, have no weight."""
+    """Only the first `houses` have weight: all counts share one shape, and so one compilation."""
     del repeats
     counts = jnp.arange(int(max(HOUSES)), dtype=houses.dtype)[None, :] < houses[:, None]
     return params.replace(weights=jnp.where(counts, 1.0 / houses[:, None], 0.0))
@@ -69,7 +69,7 @@ def _x_out(params: Any, repeats: int, x_out: jax.Array) -> Any:
 
 
 def _heterogeneity(params: Any, repeats: int, spread: jax.Array) -> Any:
-    """Ca and Ua uniform within `spread` % from house to house, another stock in each repeat; each law uses its own."""
+    """Ca and Ua of each house uniform within `spread` %, drawn anew per repeat; each local law knows its own."""
     house, (episodes, n) = params.house, params.weights.shape
     stock = jax.random.uniform(jax.random.key(2), (2, repeats, n), float, -1.0, 1.0)
     factor = 1.0 + spread[None, :, None] / 100.0 * stock[:, jnp.arange(episodes) % repeats]

@@ -11,9 +11,9 @@ from jaxouter.plants.pitch import W_PRINTED
 from jaxouter.tasks.task import Axis, Scenario, Sweep, Task
 
 SETPOINT = 14.66  # crad; the amplitude that gives the paper's baseline of 10.91
-MAX_DELAY = 5.7  # s; one length of the delay lines for all scenarios with delays of u, which so share a compilation
+MAX_DELAY = 5.7  # s; one length of the delay lines for all scenarios with delays of u, so that they compile once
 NOISE_SEEDS = 32
-DELAYED = (10.13, 2.46)  # the paper's one delayed case; no reading of it gives its 10.13 exactly
+DELAYED = (10.13, 2.46)  # the paper's only delayed case; no reading of it gives 10.13 exactly
 
 ROBUST = {
     "history": 80,  # longer than the longest delay
@@ -51,7 +51,7 @@ def _parameters(*names: str, **static: Any) -> Any:
     return vary
 
 
-# The longest delay sets the length of the delay lines, and with it the cost of a step: no longer than needed.
+# The longest delay sets the length of the delay lines, and with it the cost of a step: keep it short.
 PITCH = Task(
     make=pitch.make,
     presets={"default": {}, "robust": ROBUST, "paper": {}},

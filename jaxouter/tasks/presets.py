@@ -34,7 +34,7 @@ DEFAULT: Options = {
     "agent.noise_sigma": (0.0125, 0.1),
 }
 PRESETS: Mapping[str, Options] = {"default": DEFAULT, "paper": PAPER}
-LIVE: Options = {  # a loop of which nothing is known: an update fits into milliseconds
+LIVE: Options = {  # an unknown plant in real time: an update must fit into milliseconds
     **DEFAULT,
     "agent.hidden": (64, 64),
     "agent.batch_size": 128,

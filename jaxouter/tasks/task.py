@@ -1,4 +1,4 @@
-"""What is declared of one plant and of no other: how it is trained on, and where it is evaluated. Plain data."""
+"""Task: everything specific to one plant, how it is trained on and where it is evaluated. Plain data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from jaxouter.plants import Plant
 
 Options = Mapping[str, Any]
-"""Options of `python -m jaxouter.train` by their names, such as `steps` or `pretraining.gradient_steps`."""
+"""Options of `python -m jaxouter.train` by name, such as `steps` or `pretraining.gradient_steps`."""
 
 
 @dataclass(frozen=True)
@@ -21,35 +21,35 @@ class Scenario:
     """Episodes under one reference, from the plant's own start."""
 
     reference: Sequence[float]
-    """Set-points, each held for an equal part of an episode."""
+    """Set-points, each held for an equal part of the episode."""
     set: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the plant, as its maker takes them; the rest is nominal."""
+    """Arguments of the plant's maker; the rest is nominal."""
     change: Mapping[str, Any] = field(default_factory=dict)
-    """What changes half way; none if empty."""
+    """Parameters that change half way; empty: none."""
     episodes: int = 1
     noise: float = 0.0
     """Standard deviation of the measurement noise, in the unit of y."""
     stable_alone: bool = True
-    """Whether the inner loop alone is stable; else an improvement in % means nothing."""
+    """Whether the inner loop alone is stable; if not, an improvement in % means nothing."""
     paper: tuple[float, float] | None = None
     """MAE in the paper: inner loop alone, its DRL."""
     adapt: Callable[[Any], Any] = lambda params: params
-    """`adapt(params) -> params` of all episodes, each leaf (episodes, ...): what a maker's arguments can't say."""
+    """`adapt(params) -> params`, each leaf (episodes, ...): changes that the maker's arguments can't express."""
 
 
 @dataclass(frozen=True)
 class Families:
-    """How the plant is made for the families of references that it declares."""
+    """How the plant is made for its families of references."""
 
     set: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the plant, as its maker takes them."""
+    """Arguments of the plant's maker."""
     adapt: Callable[[Any, jax.Array, int], Any] = lambda params, key, episodes: params
-    """`adapt(params, key, episodes) -> params`, each leaf (episodes, ...), such as a start of its own for each."""
+    """`adapt(params, key, episodes) -> params`, each leaf (episodes, ...), such as another start for each episode."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One parameter of a sweep and the values that it takes."""
+    """One parameter of a sweep and its values."""
 
     name: str
     unit: str
@@ -62,48 +62,47 @@ class Axis:
 
     @classmethod
     def linear(cls, name: str, unit: str, low: float, high: float, count: int, nominal: float) -> Axis:
-        """So many values, evenly spaced."""
+        """`count` evenly spaced values."""
         return cls(name, unit, tuple(np.linspace(low, high, count).round(6).tolist()), nominal)
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A scenario over a grid of one or two parameters that no policy is told of."""
+    """A scenario over a grid of one or two parameters, which the policies do not know."""
 
     scenario: str
-    """Name of the scenario whose episodes are varied."""
+    """Name of the scenario that is varied."""
     axes: tuple[Axis, ...]
     vary: Callable[..., Any] | None = None
-    """`vary(params, repeats, *values) -> params`, each leaf (episodes, ...), with a value of each axis (episodes,).
+    """`vary(params, repeats, *values) -> params`, each leaf (episodes, ...); one array of values (episodes,) per axis.
     None: the axis is the standard deviation of the measurement noise."""
     stride: int = 5
-    """Of a coarse grid, for policies that solve a programme at each step, every so many-th value is taken."""
+    """Every `stride`-th value makes the coarse grid, used for policies that solve an optimisation at each step."""
     repeats: int = 1
-    """Noise seeds a point."""
+    """Noise seeds per grid point."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A plant's maker with all that is declared of the plant. Called, it makes the plant.
+    """A plant's maker with everything specific to the plant. Calling the task makes the plant.
 
-    A file of one's own may name one in place of a maker: `FILE.py:NAME`. What is not declared has its default, so that
-    a maker alone is a task too.
+    `FILE.py:NAME` may name a task or a maker. All fields but the maker have defaults.
     """
 
     make: Callable[..., tuple[Plant, Any]]
     """`make(**parameters) -> plant, params`."""
     presets: Mapping[str, Options] = field(default_factory=dict)
-    """Options by the preset's name, on top of those of the same name that all plants have, or else of `default`."""
+    """Options by preset name; they override the preset of that name in `PRESETS`, or else `default`."""
     scenarios: Mapping[str, Scenario] = field(default_factory=dict)
-    """By their names, beside the families that the plant declares."""
+    """Scenarios by name, in addition to the plant's families of references."""
     reported: tuple[str, ...] = ()
-    """Scenarios on which a training is evaluated; none: all."""
+    """Scenarios on which a training is evaluated; empty: all."""
     stability: tuple[str, ...] = ()
-    """Scenarios that stand for the plants whose local stability differs; none: the first."""
+    """Scenarios for the local stability analysis, one per plant that differs; empty: the first."""
     families: Families = field(default_factory=Families)
     sweeps: Mapping[str, Sweep] = field(default_factory=dict)
     start: tuple[str, ...] = ()
-    """Parameters that say where an episode starts, not what the plant is."""
+    """Parameters that set where an episode starts, not what the plant is."""
 
     def __call__(self, **parameters: Any) -> tuple[Plant, Any]:
         """The plant and its parameters."""
@@ -111,5 +110,5 @@ class Task:
 
     @property
     def __signature__(self) -> inspect.Signature:
-        """That of the maker, from which the names of parameters are known."""
+        """Signature of the maker, from which parameter names are read."""
         return inspect.signature(self.make)

@@ -1,4 +1,4 @@
-"""Checkpoints: a pytree as named host arrays and a JSON header in one npz file with a checksum, without pickle."""
+"""Checkpoints: a pytree as named arrays, with a JSON header, in one npz file with a checksum; no pickle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 FORMAT = 2
-MARK = b"jaxouter sha256:"  # before the digest of all that precedes it, at the end of the file
+MARK = b"jaxouter sha256:"  # at the end of the file, followed by the digest of everything before it
 Tree = TypeVar("Tree")
 
 
@@ -30,10 +30,10 @@ def _is_key(leaf: Any) -> bool:
 
 
 def write(path: Path, content: bytes | memoryview) -> None:
-    """Write a file, whole or not at all, also where the power fails: to a neighbour, which then takes its name.
+    """Write a file atomically, even if the power fails: to a temporary file, which is then renamed.
 
     Raises:
-        OSError: it can't be written; `path` is as it was.
+        OSError: it can't be written; `path` is unchanged.
     """
     partial = path.with_suffix(".partial")
     try:
@@ -43,29 +43,29 @@ def write(path: Path, content: bytes | memoryview) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError:
-        partial.unlink(missing_ok=True)  # what a full disk needs first
+        partial.unlink(missing_ok=True)  # make room on a full disk
         raise
-    if os.name == "posix":  # elsewhere no folder can be opened
+    if os.name == "posix":  # elsewhere folders can't be opened
         folder = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # of the name
+            os.fsync(folder)  # makes the new name durable
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that can't
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems can't
                 raise
         finally:
             os.close(folder)
 
 
 def save(path: Path, tree: Any, **header: Any) -> None:
-    """Write `tree` to `path`, whole or not at all.
+    """Write `tree` to `path` atomically.
 
     Args:
-        path: file, replaced where it exists.
+        path: file; replaced if it exists.
         tree: pytree of arrays; PRNG keys are stored as their data.
-        **header: JSON values kept with it.
+        **header: JSON values stored with it.
 
     Raises:
-        OSError: it can't be written; `path` is as it was.
+        OSError: it can't be written; `path` is unchanged.
     """
     arrays = {name: np.asarray(jax.random.key_data(x) if _is_key(x) else x) for name, x in _named(tree).items()}
     shapes = {name: [list(array.shape), str(array.dtype)] for name, array in arrays.items()}
@@ -77,7 +77,7 @@ def save(path: Path, tree: Any, **header: Any) -> None:
 
 
 def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
-    """Read what `save` wrote.
+    """Read a file that `save` wrote.
 
     Args:
         path: file.
@@ -103,7 +103,7 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays by name, the checksum compared.
+    """Header and arrays by name, after a check of the checksum.
 
     Raises:
         ValueError: the file is not readable, damaged or of another format.
@@ -120,7 +120,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             arrays = {name: file[name] for name in file.files if name != "header"}
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError(f"it is not of format {FORMAT}, the one that this version reads")
-    # A checksum can be right beside any bytes, and zipfile and NumPy answer them with more than they document.
+    # A correct checksum does not make a valid file, and zipfile and NumPy raise more than they document.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is not a readable checkpoint ({error})") from None
     except (

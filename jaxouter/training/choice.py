@@ -1,4 +1,4 @@
-"""What observation and model must hold to represent a plant, chosen before training by what a record tells of it."""
+"""Choose history and model size for a plant before training, from its identified dead time and order."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ EXPLORATION = 3  # folded into a key
 
 
 class Choice(NamedTuple):
-    """A configuration in which what depends on the plant is chosen."""
+    """A configuration with all plant-dependent settings chosen."""
 
     config: TrainConfig
-    said: str | None  # what was chosen, in a line
+    said: str | None  # what was chosen, in one line
     warnings: tuple[str, ...]
 
 
 def choose(config: TrainConfig) -> Choice:
-    """The configuration with history, lags and length of the recorded episodes chosen by dead time and order.
+    """Choose history, lags and the length of recorded episodes by the plant's dead time and order.
 
-    They are identified from random r~. What is given stays; so does all of the built-in plants.
+    These are identified under random r~. Settings that are given stay, and so do all of the built-in plants.
 
     Raises:
         ValueError: no r~ moves the output.
@@ -51,19 +51,19 @@ def choose(config: TrainConfig) -> Choice:
                 f"within an episode of {plant.episode_steps} control steps; r~ does nothing, or its dead time is longer"
             )
             raise ValueError(f"{error} {late}") from None
-        told = f"y of {plant.name} shows no effect of r~ beside its noise in {steps:,} control steps; history stays"
-        return Choice(replace(config, explored_steps=steps), None, (f"{told} {config.history or HISTORY}",))
+        text = f"y of {plant.name} shows no effect of r~ above its noise in {steps:,} control steps; history stays"
+        return Choice(replace(config, explored_steps=steps), None, (f"{text} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
 
 
 def _of_models(params: Any) -> Dynamics:
-    """The dynamics of the models that a plant is made of."""
+    """The dynamics of a plant that consists of identified models."""
     a, b = np.asarray(params.model.a), np.asarray(params.model.b)
     return Dynamics(len(a), int(np.flatnonzero(b)[0]), 0.0, "stable", shown=True)
 
 
 def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int) -> Choice:
-    """The choice for these dynamics, of a plant or of several that are drawn, told by so many control steps."""
+    """The choice for the dynamics of one or several drawn plants, identified in `steps` control steps."""
     dead, order = max(one.dead for one in found), max(one.order for one in found)
     wanted = max(dynamics.history_for(one.order, one.dead, HISTORY) for one in found)
     given = plant.history if config.history is None else config.history
@@ -72,13 +72,13 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
         whose = "--history" if config.history is not None else f"what {plant.name} declares"
         warnings.append(
             f"the dead time of {dead} control steps does not fit in the {history} past samples of the observation "
-            f"({whose}), which then can't tell what r~ is under way; set --history {wanted}"
+            f"({whose}), so the observation misses r~ that y has yet to follow; set --history {wanted}"
         )
     start, warned = _pretraining(config, plant, history if history > dead else wanted, dead)
     if 2 * dead > plant.episode_steps:
         warned += (
-            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, and r~ "
-            f"moves y only in the rest; {_longer(4 * dead)}",
+            f"the dead time of {dead} control steps is longer than half an episode of {plant.episode_steps}, so r~ "
+            f"moves y only in its remainder; {_longer(4 * dead)}",
         )
     if config.pretraining.lags is None and start.lags == history:
         start = replace(start, lags=None)
@@ -88,24 +88,24 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
             f"y takes about {settling:.0f} control steps to settle, longer than an episode of {plant.episode_steps}; "
             f"{_longer(2 * round(settling))}, or the control step longer",
         )
-    told = [f"dead time {dead} control steps", f"order {order}"]
-    told += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
+    identified = [f"dead time {dead} control steps", f"order {order}"]
+    identified += [f"settling time {settling:.0f} control steps"] if 0.0 < settling < np.inf else []
     chosen = [f"history {history}"] if given is None else []
     chosen += [f"lags {start.lags}"] if start.lags != config.pretraining.lags else []
     longer = start.episode_steps != config.pretraining.episode_steps
     chosen += [f"recorded episodes of {start.episode_steps} control steps"] if longer else []
-    said = f"identified: {', '.join(told)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
+    said = f"identified: {', '.join(identified)}" + (f"; chosen: {', '.join(chosen)}" if chosen else "")
     known = replace(config, explored_steps=steps, pretraining=start)
     return Choice(known if given is not None else replace(known, history=history), said, (*warnings, *warned))
 
 
 def _longer(steps: int) -> str:
-    """What to do about an episode that is too short."""
+    """Advice for an episode that is too short."""
     return f"make episode_steps {steps} or more (--episode-steps for gym:, fmu: and log:)"
 
 
 def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
-    """Lags and length of the recorded episodes, of which a model holds at most half; and what is wrong with them."""
+    """Pretraining with lags (at most half a recorded episode) and length of recorded episodes; and warnings."""
     start = config.pretraining
     if not start.gradient_steps or plant.identified:
         return start, ()

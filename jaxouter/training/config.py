@@ -16,35 +16,35 @@ from jaxouter.identification.steady_state import LEVELS
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
-HUGE = 2**31  # no number of a configuration is as large
+HUGE = 2**31  # numbers of a configuration must be smaller
 
 
 @dataclass(frozen=True)
 class PretrainingConfig:
-    """A start by analytic policy gradient on a model identified from recorded episodes, before the learner begins."""
+    """Pretraining of the actor on a model identified from recorded episodes, before the agent learns on the plant."""
 
     gradient_steps: int = 0
-    """Gradient steps of the actor on the identified model; 0: no such start."""
+    """Gradient steps of the actor on the identified model; 0: no pretraining."""
     episodes: int = 64
-    """Episodes of the plant that are recorded under random r~, besides --steps."""
+    """Episodes of the plant recorded under random r~, in addition to --steps."""
     plants: int = 1
-    """Plants of which they are, each drawn from --randomise; more than one needs it."""
+    """Plants they are recorded on, each drawn from --randomise; more than one needs --randomise."""
     episode_steps: int | None = None
-    """Control steps of a recorded episode, and so of one on the model; None: an episode of the plant."""
+    """Length of a recorded episode in control steps, and of an episode on the model; None: the plant's episode."""
     lags: int | None = None
-    """Past samples of r~ and y in the model; None: as many as the observation holds, or as the dead time takes."""
+    """Past samples of r~ and y in the model; None: as in the observation, or more if the dead time needs them."""
     batch_size: int = 64
-    """Episodes of the model a gradient step."""
+    """Episodes on the model per gradient step."""
     noise: float = 0.0
-    """Largest standard deviation of the measurement noise that half of these have; 1 is half the set-point range."""
+    """Largest standard deviation of measurement noise, which half of these have; 1 is half the set-point range."""
     load: float = 0.0
-    """Largest unseen step of r~, at a random time, that half of these have; 1 is half the range of r~."""
+    """Largest load (unseen step added to r~ at a random time), which half of these have; 1 is half the r~ range."""
     log_above: float = 0.0
-    """Cost a step c above which episodes count less, as c log(1 + cost / c): so those of plants that are hard to hold
-    don't outweigh all others; 0: each counts in full."""
+    """c > 0: an episode's cost per step counts as c log(1 + cost / c); 0: it counts in full.
+    This way episodes on plants that are hard to control don't outweigh all others."""
 
     def check(self) -> None:
-        """Raises ValueError, naming field, value and what is allowed."""
+        """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
         for name in ("noise", "load", "log_above"):
@@ -62,48 +62,47 @@ class TrainConfig:
     plant: Annotated[str, tyro.conf.Positional]
     """Plant to learn on: pitch, heaters, FILE.py:NAME (your own), gym:ID, fmu:FILE or log:FILE."""
     preset: str
-    """Preset that supplies the defaults: default, paper; robust of pitch and heaters."""
+    """Preset that supplies the defaults: default, paper; for pitch and heaters also robust."""
     agent: AgentConfig
-    """What learns; --agent NAME chooses another."""
+    """Settings of the learning algorithm; --agent NAME chooses another."""
     seed: int = 0
     """Seed of the first run."""
     seeds: int = 1
-    """Runs with consecutive seeds, trained side by side."""
+    """Number of runs, with consecutive seeds, trained in parallel."""
     devices: int = 1
-    """Devices, over all processes. Each takes seeds of its own; where there are more devices than seeds, each learner
-    spans several, which share its environments, replay and batch; its random numbers then differ from those of one
-    device. Devices of one process share the episodes of pretraining, with the same random numbers as one device."""
+    """Devices over all processes, which share the seeds and the episodes of pretraining.
+    With more devices than seeds, several share each learner: its results then differ from those of one device."""
     steps: int = 200_000
-    """Environment steps of the agent, over all environments, prefill included; 0: the pretrained actor stays."""
+    """Environment steps of the agent, over all environments, prefill included; 0: pretraining only."""
     environments: int = 1
-    """Environments that roll out in parallel."""
+    """Parallel environments."""
     epoch: int = 2_000
-    """Environment steps an epoch, the unit of progress, evaluation and checkpoints."""
+    """Environment steps per epoch, the unit of progress, evaluation and checkpoints."""
     history: int | None = None
-    """Past samples of y and r~ in the observation; None: what the plant declares, or else chosen by its dead time."""
+    """Past samples of y and r~ in the observation; None: as the plant declares, or else chosen by its dead time."""
     integral_steps: float | None = None
     """Time constant of the leaky integral, in control steps; None: a quarter of an episode."""
     redraw: float = 0.0
     """Probability at each control step that the set-point is redrawn within an episode."""
     randomise: plants.Ranges = ()
-    """Numbers of the plant that are drawn anew for each episode: name, least, greatest (and again)."""
+    """Parameters of the plant drawn for each episode: name, least, greatest value, repeated for each."""
     residual: bool = False
-    """Learn a correction of the static prefilter, identified first, instead of r~ itself."""
+    """Learn a correction to the static prefilter (identified first) instead of r~ itself."""
     reward_scale: float = 1.0
-    """Multiplies the reward, in the plant's error scales, before it is learned from."""
+    """Factor on the reward (in the plant's error scales) that the agent learns from."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
-    """Control steps of the plant by which the dead time was identified before, to choose what is not given."""
+    """Control steps spent to identify the dead time, for settings that were not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
-    """What a plant gym:ID, fmu:FILE or log:FILE does not say itself."""
+    """What a plant gym:ID, fmu:FILE or log:FILE does not declare itself."""
     pretraining: PretrainingConfig = field(default_factory=PretrainingConfig)
-    """The start."""
+    """Pretraining of the actor on a model identified from recorded episodes."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             object.__setattr__(self, name, declaration.plain(value))
 
     def check(self) -> TrainConfig:
-        """Itself.
+        """Check the configuration; returns it.
 
         Raises:
             ValueError: names the field, its value and what is allowed.
@@ -151,7 +150,7 @@ class TrainConfig:
 
     @property
     def shards(self) -> int:
-        """Devices that one learner spans."""
+        """Devices per learner."""
         return self.devices // self.side_by_side
 
     @property
@@ -161,7 +160,7 @@ class TrainConfig:
 
     @property
     def identification_steps(self) -> int:
-        """Control steps recorded before the training, of each seed; none of a plant that is made from a record."""
+        """Control steps recorded before the training of each seed; none for a plant made from recorded data."""
         plant, start = plants.make(self.plant)[0], self.pretraining
         if plant.identified:
             return 0
@@ -170,12 +169,12 @@ class TrainConfig:
 
     @property
     def environment_steps(self) -> int:
-        """Control steps of the plant that one seed sees, identification included."""
+        """Control steps of the plant per seed, identification included."""
         return self.steps + self.identification_steps
 
     @property
     def total_updates(self) -> int:
-        """Gradient updates of one seed."""
+        """Gradient updates per seed."""
         return self.agent.data.total_updates(self.steps, self.environments)
 
 
@@ -184,16 +183,16 @@ def preset(plant: str, name: str = "default", agent: str | None = None) -> Train
 
     Args:
         plant, name: registered names.
-        agent: None: the preset's; another has its own defaults.
+        agent: None: the preset's; another agent comes with its own defaults.
 
     Raises:
-        ValueError: unknown plant, preset or agent; lists those that exist.
+        ValueError: unknown plant, preset or agent; lists the known ones.
     """
     return configured(plant, name, tasks.options(plant, name), agent)
 
 
 def configured(plant: str, name: str, options: tasks.Options, agent: str | None = None) -> TrainConfig:
-    """The configuration of these options, among them the agent's name; of another agent its own defaults."""
+    """The configuration from options, which include the agent's name; another `agent` comes with its own defaults."""
     options = dict(options)
     own = options.pop("agent")
     kind = agents.resolve(agent or own)
@@ -204,10 +203,10 @@ def configured(plant: str, name: str, options: tasks.Options, agent: str | None 
 
 
 def with_options(config: TrainConfig, options: tasks.Options) -> TrainConfig:
-    """The configuration with these options changed, by their names, such as `agent.discount`.
+    """The configuration with some options changed, by name, such as `agent.discount`.
 
     Raises:
-        ValueError: there is no such option; lists those that exist.
+        ValueError: there is no such option; lists the options.
     """
     return _changed(config, options, "")
 
@@ -216,7 +215,7 @@ Config = TypeVar("Config")
 
 
 def _changed(config: Config, options: tasks.Options, prefix: str) -> Config:
-    """A dataclass with the options of its own, and of the dataclasses within it, whose names begin with a prefix."""
+    """A dataclass with its options, and those of nested dataclasses, changed; their names begin with `prefix`."""
     known = {f.name: getattr(config, f.name) for f in dataclasses.fields(cast(Any, config))}
     changes: dict[str, Any] = {}
     for option, value in options.items():
@@ -230,7 +229,7 @@ def _changed(config: Config, options: tasks.Options, prefix: str) -> Config:
 
 
 def _numbers(values: Any, name: str = "") -> Iterator[tuple[str, float]]:
-    """All numbers in nested values, with their names."""
+    """All numbers in nested values, by name."""
     if isinstance(values, dict):
         for key, value in values.items():
             yield from _numbers(value, f"{name}.{key}" if name else key)
@@ -242,16 +241,16 @@ def _numbers(values: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Plain dict, for JSON; with the agent stands its name."""
+    """Plain dict, for JSON, with the agent's name among its settings."""
     values = dataclasses.asdict(config)
     return values | {"agent": {"name": agents.name_of(config.agent), **values["agent"]}}
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
-    """The configuration from what `to_dict` gave, also after a round trip through JSON.
+    """The inverse of `to_dict`, also after a round trip through JSON.
 
     Raises:
-        ValueError: a field is missing, unknown or of another type, or the agent is not known.
+        ValueError: a field is missing, unknown or of the wrong type, or the agent is unknown.
     """
     for name in ("agent", "plant_options", "pretraining"):
         if not isinstance(values.get(name), dict):
@@ -266,5 +265,7 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     for cls, of_cls in (*parts, (kind, of_agent)):
         names = {f.name for f in dataclasses.fields(cast(Any, cls))}
         if set(of_cls) != names:
-            raise ValueError(f"the configuration has fields {sorted(map(str, set(of_cls) ^ names))} missing or unknown")
+            raise ValueError(
+                f"fields of the configuration are missing or unknown: {sorted(map(str, set(of_cls) ^ names))}"
+            )
     return msgspec.convert(whole, TrainConfig, dec_hook=lambda _, found: msgspec.convert(found, kind))

@@ -1,7 +1,7 @@
-"""More than one device or process: the mesh, what stands where on it, and what processes tell each other.
+"""Several devices or processes: the mesh, the layout of the state on it, and communication between processes.
 
-Seeds are split over the first axis of the mesh; over the second one the environments of each learner, with their part
-of the replay and of each batch. One device is a mesh of one.
+Seeds are split over the first axis of the mesh. The environments of each learner, with their share of the replay and of
+each batch, are split over the second. One device is a mesh of one.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from jaxouter.training.trainer import Trainer, build
 
 SEEDS = "seeds"
 HOUSES = "houses"
-# Matrix products on a CPU by Eigen, not by YNNPACK, jax 0.10's choice: a twentieth faster, and a tenth where devices
-# share their cores.
+# On CPUs use Eigen for matrix products instead of YNNPACK, the default of jax 0.10: 5 % faster, and 10 % if devices
+# share cores.
 EIGEN = {"xla_cpu_experimental_ynn_fusion_type": ""}
 Tree = TypeVar("Tree")
 
@@ -39,14 +39,14 @@ ENVIRONMENT: Any = P(SEEDS, AXIS)
 
 @dataclass(frozen=True)
 class Processes:
-    """How this process finds the others; None: there are none, or JAX finds them (SLURM, Kubernetes)."""
+    """How this process finds the others. None: there are none, or JAX finds them (SLURM, Kubernetes)."""
 
     coordinator: str | None = None
     num_processes: int | None = None
     process_id: int | None = None
 
     def check(self, devices: int) -> Processes:
-        """Itself.
+        """Check the options; returns them.
 
         Raises:
             ValueError: names the option, its value and what is allowed.
@@ -67,17 +67,17 @@ class Processes:
 
 
 def connect(devices: int, processes: Processes) -> None:
-    """Make CPU devices where the CPU is what there is, and join the other processes; before JAX is used at all.
+    """Make CPU devices (used if there is nothing but the CPU) and join the other processes; call before any use of JAX.
 
-    JAX finds the others by itself in a step of several SLURM tasks and in an indexed Kubernetes job, if more than one
-    device is asked for.
+    With more than one device, JAX finds the other processes by itself in a SLURM step of several tasks and in an
+    indexed Kubernetes job.
 
     Args:
         devices: in all processes together.
         processes: checked.
 
     Raises:
-        ValueError: the processes did not come together.
+        ValueError: the processes did not connect.
     """
     tasks = int(os.environ.get("SLURM_STEP_NUM_TASKS", "1"))
     found = devices > 1 and (tasks > 1 or "JOB_COMPLETION_INDEX" in os.environ)
@@ -89,11 +89,11 @@ def connect(devices: int, processes: Processes) -> None:
     try:
         jax.distributed.initialize(processes.coordinator, processes.num_processes, processes.process_id)
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"the processes did not come together: {error}") from None
+        raise ValueError(f"the processes did not connect: {error}") from None
 
 
 def part() -> None:
-    """The end of what the processes do together: each goes on, or ends, without waiting for the others."""
+    """Disconnect: from here on no process waits for the others."""
     if jax.distributed.is_initialized():
         jax.distributed.shutdown()
 
@@ -102,14 +102,14 @@ def _make_cpu_devices(count: int) -> None:
     try:
         jax.config.update("jax_num_cpu_devices", count)
     except RuntimeError:
-        return  # JAX is in use already: the devices are those that there are, and `mesh` counts them
+        return  # JAX is in use already; `mesh` checks the number of devices
 
 
 def mesh(config: TrainConfig) -> Mesh:
-    """Devices (seeds, environments) of a run, as many of each process.
+    """Devices (seeds, environments) of a run, the same number from each process.
 
     Raises:
-        ValueError: there are fewer devices, or they can't be shared out evenly.
+        ValueError: there are too few devices, or they can't be split evenly.
     """
     processes = jax.process_count()
     if config.devices % processes:
@@ -130,15 +130,15 @@ def is_first() -> bool:
 
 
 def any_process(flag: bool) -> bool:
-    """Whether the flag is set in any process; asked in all of them at once."""
+    """Whether the flag is set in any process; must be called in all of them."""
     return flag if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.asarray(flag)).any())
 
 
 def text_from_first(make: Callable[[], str]) -> str:
-    """What `make` gives in the first process, in all of them; it is called there alone.
+    """The result of `make`, called in the first process only, in all processes.
 
     Raises:
-        ValueError, OSError: as `make` does, in all of them.
+        ValueError, OSError: `make` raised it; raised in all processes.
     """
     if jax.process_count() == 1:
         return make()
@@ -157,7 +157,7 @@ def text_from_first(make: Callable[[], str]) -> str:
 
 
 def in_first(act: Callable[[], None]) -> None:
-    """Do it in the first process alone; where it fails, all do, as `text_from_first`."""
+    """Call `act` in the first process only; its errors are raised in all, see `text_from_first`."""
 
     def text() -> str:
         act()
@@ -167,7 +167,7 @@ def in_first(act: Callable[[], None]) -> None:
 
 
 def state_from_first(make: Callable[[], TrainState], like: TrainState) -> TrainState:
-    """As `text_from_first`, for a state whose shapes are those of `like`."""
+    """Like `text_from_first`, for a state with the shapes of `like`."""
     if jax.process_count() == 1:
         return make()
     made: list[TrainState] = []
@@ -190,7 +190,7 @@ def _keyed(tree: Any, like: Any) -> Any:
 
 
 def get(tree: Tree) -> Tree:
-    """Arrays that lie on many devices, whole, on the host of every process."""
+    """Arrays that are split over devices, as whole arrays on the host of every process."""
     if jax.process_count() == 1:
         return jax.device_get(tree)
     everywhere = NamedSharding(jax.tree.leaves(tree)[0].sharding.mesh, P())
@@ -200,7 +200,7 @@ def get(tree: Tree) -> Tree:
 
 @dataclass(frozen=True)
 class Fleet:
-    """The trainer's functions over a mesh, one seed on each member of its first axis. Static and hashable."""
+    """The trainer's functions on a mesh, one seed per member of its first axis. Static and hashable."""
 
     trainer: Trainer  # of one shard
     mesh: Mesh
@@ -210,12 +210,12 @@ class Fleet:
         """The fleet of a configuration.
 
         Raises:
-            ValueError: the configuration does not fit together, or not to the devices that there are.
+            ValueError: the configuration is inconsistent, or does not fit the available devices.
         """
         return cls(build(config, config.shards)[0], mesh(config))
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
-        """Whole states, one a seed, stacked and laid out over the mesh."""
+        """Stack whole states, one per seed, and lay them out on the mesh."""
 
         def place(spec: P, part: Any) -> Any:
             return jax.tree.map(lambda *leaves: self._place(spec, leaves), *part)
@@ -224,7 +224,7 @@ class Fleet:
 
     @property
     def layout(self) -> Any:
-        """What of the states of all seeds lies on which axis of the mesh."""
+        """The mesh axes of each part of the stacked states."""
         return TrainState(
             agent=SEED,
             data=self.trainer.driver.layout(SEED, ENVIRONMENT),
@@ -248,31 +248,31 @@ class Fleet:
 
     @property
     def prefill(self) -> jax.stages.Wrapped:
-        """`Trainer.prefill` of every seed, `prefill(states, params) -> states`; donates the states."""
+        """`Trainer.prefill` for every seed, `prefill(states, params) -> states`; donates the states."""
         return _jitted(self)[0]
 
     @property
     def epoch(self) -> jax.stages.Wrapped:
-        """`Trainer.epoch` of every seed, `epoch(states, params, steps) -> states, metrics`, the metrics (seeds,).
+        """`Trainer.epoch` for every seed, `epoch(states, params, steps) -> states, metrics`, metrics (seeds,).
 
         Donates the states; compiled once for each number of steps.
         """
         return _jitted(self)[1]
 
 
-@cache  # so that equal fleets share what is compiled
+@cache  # so that equal fleets share compiled functions
 def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
     def mapped(function: Callable[..., Any], out_specs: Any) -> Callable[..., Any]:
         def of_one(states: TrainState, params: EnvParams) -> Any:
             state = jax.tree.map(lambda leaf: jnp.squeeze(leaf, 0), states)
             return jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), function(state, params))
 
-        # Without the check of replication: what XLA is told by it is not used here, and scans would need casts.
+        # No check of replication: it has no benefit here, and scans would need casts.
         return jax.shard_map(
             of_one, mesh=fleet.mesh, in_specs=(fleet.layout, P()), out_specs=out_specs, check_vma=False
         )
 
-    # Told where its results are, XLA does not choose another layout that would be compiled for once more.
+    # Fix the layout of the results; XLA might choose another one, and the next call would compile again.
     layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), fleet.layout)
     on_cpu = fleet.mesh.devices.flat[0].platform == "cpu"
 
@@ -294,9 +294,9 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
 
 
 def spread(tree: Tree, members: int, devices: int) -> Tree:
-    """Arrays with one entry a member, such as the parameters of a large population, split over so many devices.
+    """Split arrays with one entry per member, such as the parameters of a large population, over devices.
 
-    What is computed from them under jit is split alike, and draws the same numbers as on one device.
+    Computations on them under jit are split alike, with the same random numbers as on one device.
 
     Args:
         tree: pytree; arrays of shape (members,) are split, all others are on every device.
@@ -304,7 +304,7 @@ def spread(tree: Tree, members: int, devices: int) -> Tree:
         devices: must divide `members`.
 
     Raises:
-        ValueError: there are fewer devices, or members can't be shared out evenly.
+        ValueError: there are too few devices, or the members can't be split evenly.
     """
     if not 0 < devices <= jax.device_count() or members % devices:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Environments side by side, in which an agent explores, and all that a training changes."""
+"""Parallel environments in which an agent explores, and the state of a training."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from jaxouter.loop.observation import Signals
 from jaxouter.loop.policy import AffineParams
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
-AXIS = "environments"  # over the shards of a learner
-EPISODES = 16  # of a diagnosis
+AXIS = "environments"  # mesh axis of a learner's shards
+EPISODES = 16  # per diagnosis
 
 
 class TrainState(NamedTuple):
     """All training state of one seed."""
 
     agent: Any
-    data: Any  # of the driver: the replay, or nothing
+    data: Any  # of the driver: the replay, or ()
     env: EnvState  # (E, ...)
     obs: jax.Array  # (E, n)
-    noise: Any  # (E, ...), what exploration remembers
+    noise: Any  # (E, ...), state of the exploration noise
     base: AffineParams  # base law of the policy
     key: chex.PRNGKey
     steps: jax.Array  # int32, environment steps so far
@@ -40,31 +40,31 @@ class Step(NamedTuple):
     reward: jax.Array  # (E,), in the learner's scale
     terminated: jax.Array  # (E,), bool
     truncated: jax.Array  # (E,), bool
-    plant_reward: jax.Array  # (E,), as the plant gives it
+    plant_reward: jax.Array  # (E,), in the unit of y
     final_obs: jax.Array  # (E, n), before any reset
 
 
 @dataclass(frozen=True)
 class Environments:
-    """The environments of one training run, or of one of the shards into which they are split. Static and hashable.
+    """The environments of one training run, or of one of its shards. Static and hashable.
 
-    Shards run as members of the mapped axis `AXIS`; agent, key and counters are the same in all.
+    Shards are members of the mapped axis `AXIS`; agent, key and counters are the same in all.
     """
 
     env: Environment
     policy: LearnedPolicy
     agent: Agent
     count: int
-    """Of this shard."""
+    """Environments of this shard."""
     steps: int
-    """Of the whole training, all environments together."""
+    """Environment steps of the whole training, over all environments."""
     reward_scale: float
-    """From the plant's reward to the learner's, whatever the unit of y."""
+    """Factor from the plant's reward to the learner's, which makes it independent of the unit of y."""
     shards: int = 1
 
     @property
     def total(self) -> int:
-        """Environments of all shards."""
+        """Environments over all shards."""
         return self.count * self.shards
 
     def fresh(self, key: chex.PRNGKey, params: EnvParams, data: Any) -> TrainState:
@@ -84,21 +84,21 @@ class Environments:
         )
 
     def policy_params(self, state: TrainState) -> LearnedParams:
-        """What the policy has learned so far."""
+        """The current parameters of the policy."""
         return LearnedParams(self.agent.actor(state.agent), state.base)
 
     def keys(self, state: TrainState, steps: int, n: int) -> list[chex.PRNGKey]:
-        """N keys for each of the next `steps` steps of all environments, (steps,) each, of this shard alone.
+        """`n` arrays of keys (steps,), for the next `steps` steps of all environments; differ between shards.
 
-        They depend on the number of the step, not on where an epoch began. Numbers are drawn from them for all steps
-        at once, before the loop: within it each draw would cost as much as a small matrix product.
+        A key depends on the number of the step, not on where an epoch began. Random numbers are drawn for all steps at
+        once, before the loop, as each draw inside it would cost as much as a small matrix product.
         """
         numbers = state.steps + self.total * jnp.arange(steps, dtype=state.steps.dtype)
         key = state.key if self.shards == 1 else jax.random.fold_in(state.key, jax.lax.axis_index(AXIS))
         return list(jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), n), out_axes=1)(numbers))
 
     def each(self, keys: chex.PRNGKey) -> chex.PRNGKey:
-        """A key for each environment: keys (steps,) -> (steps, E)."""
+        """One key per environment: keys (steps,) -> (steps, E)."""
         return jax.vmap(lambda key: jax.random.split(key, self.count))(keys)
 
     def normals(self, keys: chex.PRNGKey) -> jax.Array:
@@ -108,11 +108,11 @@ class Environments:
     def explore(self, state: TrainState, normal: jax.Array) -> tuple[jax.Array, Any, Any, jax.Array]:
         """The agent's action in every environment.
 
-        An action that is not finite becomes zero: one of the three treatments of NaN (the environment passes r, a
-        roll-out has diverged), and the one that keeps a broken actor out of the data.
+        An action that is not finite becomes zero, which keeps a broken actor out of the data. (Elsewhere NaN is treated
+        otherwise: the environment passes r through, and a roll-out counts as diverged.)
 
         Returns:
-            actions (E,), the next noise, extras, and which actions were finite (E,).
+            actions (E,), the next noise, extras, and whether each action was finite (E,).
         """
         progress = state.steps.astype(float) / self.steps
         first = state.env.k == 0
@@ -124,7 +124,7 @@ class Environments:
     def step(
         self, state: TrainState, params: EnvParams, action: jax.Array, keys: chex.PRNGKey
     ) -> tuple[TrainState, Step]:
-        """Every environment takes one step with its action (E,) and key (E,)."""
+        """One step of every environment, given actions (E,) and keys (E,)."""
         before = state.env
         r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.base, before.r, action)
         obs, env, reward, terminated, truncated, info = jax.vmap(self.env.step, (0, 0, 0, None))(
@@ -144,17 +144,17 @@ class Environments:
         return state, Step(signals, action, scaled, terminated, truncated, reward, info["final_observation"])
 
     def expectations(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
-        """What the agent expects of fresh training episodes, and what comes.
+        """Expected and actual return of fresh training episodes.
 
         Returns:
-            q_start, return_start: means over episodes, discounted and in the learner's scale, without exploration and
-            bootstrapped where time is up.
+            q_start, return_start: means over episodes, discounted, in the learner's scale, without exploration;
+            return_start is bootstrapped at the time limit.
         """
         expected, came = jax.vmap(self._episode, (0, None, None))(jax.random.split(key, EPISODES), state, params)
         return {"q_start": jnp.mean(expected), "return_start": jnp.mean(came)}
 
     def _episode(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> tuple[jax.Array, jax.Array]:
-        """Value that the agent gives to an episode's start, and the discounted return."""
+        """The agent's value of an episode's start, and the actual discounted return."""
         gamma, learned = self.agent.data.discount, self.policy_params(state)
 
         def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:

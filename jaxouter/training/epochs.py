@@ -1,4 +1,4 @@
-"""Training as plain Python around the jitted epochs: resume, progress, metrics, checkpoints."""
+"""The training loop in plain Python around jitted epochs: resume, progress, metrics, checkpoints."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ Pretrained = Callable[[int, PretrainingState, Callable[[], Row]], None]
 
 
 class _StoppedError(Exception):
-    """Asked to end early during the start."""
+    """Stopped during the pretraining."""
 
 
 class NotFiniteError(Exception):
-    """What was learned has become useless: numbers that are not finite."""
+    """Learned parameters are no longer finite."""
 
 
 class Pace:
-    """How often to do something: so that it takes no more than a share of the time."""
+    """Limits how often something is done, so that it takes no more than a share of the time."""
 
     SHARE = 0.02
 
     def __init__(self, least: float = 0.0) -> None:
-        """Args: least: seconds between two times, at least; then what the first one takes, compilation, is let pass."""
+        """Args: least: seconds between two times, at least; if positive, the first one (compilation) does not count."""
         self._least, self._took, self._ended, self._times = least, 0.0, -math.inf, 0
 
     def due(self) -> bool:
-        """Whether enough time has passed since the last one."""
+        """Whether enough time has passed since the last time."""
         return time.monotonic() - self._ended >= max(self._least, self._took / self.SHARE)
 
     def do(self, what: Callable[[], T]) -> T:
-        """Do it, and take the time."""
+        """Do it, and measure how long it takes."""
         begun, self._times = time.monotonic(), self._times + 1
         found = what()
         self._ended = time.monotonic()
@@ -64,33 +64,33 @@ def train(
 ) -> dict[int, TrainState] | None:
     """Train every seed of a run to the end, from the newest epoch of which all have a checkpoint, or from the start.
 
-    Each epoch is run for all seeds, as many at a time as the devices take, before the next one. Called in every
-    process; the first one alone reads and writes the folder, and calls `on_epoch` and `report`. Everything is saved at
-    the end, where it ends early, and as often in between as `Pace` allows.
+    Each epoch runs for all seeds, as many at a time as fit on the devices, before the next one starts. Call it in every
+    process; only the first one reads and writes the folder, and calls `on_epoch` and `report`. Everything is saved at
+    the end, also of a run that is stopped, and in between as often as `Pace` allows.
 
     Args:
-        run: folder; metrics and checkpoints go there.
-        on_epoch: called with trainer and state after each epoch; what it returns joins the row (evaluation).
+        run: run folder for metrics and checkpoints.
+        on_epoch: called with trainer and state after each epoch; its result is added to the row (evaluation).
         report: called with seed and row after each epoch (progress).
-        stop: asked after each epoch of all seeds whether to end early. All processes end if one does.
-        pretrained: called as the actor is pretrained with seed, how far that is, and what gives `on_epoch` of it
+        stop: asked after each epoch of all seeds whether to stop. All processes stop if one does.
+        pretrained: called during pretraining with the seed, its state, and a function that gives `on_epoch` of it
             (progress).
-        say: called with what is going on before (progress).
+        say: called with each phase before the epochs, see `Say` (progress).
 
     Returns:
-        The final state of each seed, on the host; None where it ended early.
+        The final state of each seed, on the host; None if it was stopped.
 
     Raises:
         ValueError: a checkpoint is not readable, the identification failed, or there are too few devices.
-        OSError: something can't be written; what was saved before is whole.
-        NotFiniteError: parameters are not finite any more; what was saved before is.
+        OSError: something can't be written; what was saved before is intact.
+        NotFiniteError: parameters are no longer finite; those saved before are.
     """
     cfg, fleet, (trainer, params) = run.config, run.fleet, run.trainer
     done = int(devices.text_from_first(lambda: str(run.common_epoch())))
     rounds = [run.seeds[i : i + cfg.side_by_side] for i in range(0, cfg.seeds, cfg.side_by_side)]
     pace = Pace()
 
-    def heard(seed: int, at: PretrainingState, state: Callable[[], TrainState]) -> None:
+    def on_pretraining(seed: int, at: PretrainingState, state: Callable[[], TrainState]) -> None:
         stopping = jax.process_count() == 1 and stop()
         if stopping or int(at.done) == cfg.pretraining.gradient_steps or pace.due():
             pace.do(lambda: run.save_pretraining(seed, at))
@@ -98,14 +98,14 @@ def train(
             raise _StoppedError
         pretrained(seed, at, lambda: on_epoch(trainer, state()))
 
-    def begins(what: str, done_of_it: int, of: int) -> None:
+    def on_phase(what: str, done_of_it: int, of: int) -> None:
         if done_of_it and jax.process_count() == 1 and stop():
             raise _StoppedError
         say(what, done_of_it, of)
 
     begun = time.perf_counter()
     try:
-        states = {seeds: _begin(run, seeds, done, heard, begins) for seeds in rounds}
+        states = {seeds: _begin(run, seeds, done, on_pretraining, on_phase) for seeds in rounds}
     except _StoppedError:
         return None
 
@@ -120,7 +120,7 @@ def train(
 
     def keep(seed: int, state: TrainState, epoch: int, metrics: Row, rates: Row) -> None:
         if epoch == 0 and run.rows(seed):
-            return  # from before a kill
+            return  # written before the run was killed
         row: Row = {"epoch": epoch, "steps": int(state.steps), "updates": trainer.updates(state), **metrics}
         if epoch > 0:
             row |= {name: float(value) for name, value in trainer.diagnose(state, params).items()}
@@ -130,7 +130,7 @@ def train(
 
     if cfg.pretraining.gradient_steps and not done:
         rates = {"seconds": (time.perf_counter() - begun) / cfg.seeds}
-        for seed, state in every_seed():  # what the start gave is the row of epoch 0
+        for seed, state in every_seed():  # the result of pretraining is the row of epoch 0
             _check(seed, 0, state)
             devices.in_first(partial(keep, seed, state, 0, {}, rates))
         pace.do(partial(save, 0))
@@ -161,7 +161,7 @@ def train(
 
 
 def _check(seed: int, epoch: int, state: TrainState) -> None:
-    """Raises NotFiniteError, naming what is not finite."""
+    """Raises NotFiniteError; names what is not finite."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.agent):
         if not np.isfinite(leaf).all():
             name = str(getattr(path[0], "name", "agent")).replace("_", " ")
@@ -172,10 +172,10 @@ def _begin(
     run: Run,
     seeds: range,
     done: int,
-    heard: Callable[[int, PretrainingState, Callable[[], TrainState]], None],
+    report: Callable[[int, PretrainingState, Callable[[], TrainState]], None],
     say: Say,
 ) -> TrainState:
-    """States of some seeds after so many epochs: from their checkpoints, or started and prefilled."""
+    """States of some seeds after `done` epochs: from their checkpoints, or pretrained and prefilled."""
     trainer, params = run.trainer
     like = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
     kept = [seed for seed in seeds if done in run.whole(seed)] if devices.is_first() else []
@@ -186,7 +186,7 @@ def _begin(
         if loads:
             return run.load(seed, done)[0]
         each = run.config.devices // jax.process_count()
-        return trainer.start(seed, params, partial(heard, seed), run.load_pretraining(seed), each, say)
+        return trainer.start(seed, params, partial(report, seed), run.load_pretraining(seed), each, say)
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
     if loads or not run.config.epochs:

@@ -1,4 +1,4 @@
-"""The driver of off-policy learners: prefill, then epochs in which environments roll out and the learner updates."""
+"""Driver for off-policy learners: prefill, then epochs of roll-outs and updates."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from jaxouter.loop.observation import Observer, Signals
 from jaxouter.training.environments import AXIS, Environments, Step, TrainState
 
 FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
-HOLD = 0.1  # probability that the random action of the prefill is redrawn at a step
+HOLD = 0.1  # probability per step that the random action of the prefill is redrawn
 
 
 @dataclass(frozen=True)
 class OffPolicyDriver:
-    """The pure functions of a training from a replay, or of one of its shards. Static and hashable."""
+    """The pure functions of a training from a replay, or of one shard of it. Static and hashable."""
 
     environments: Environments
     agent: OffPolicyAgent
-    data: OffPolicy  # the batch size is that of a shard
-    replay: Replay  # of a shard
+    data: OffPolicy  # with the batch size of one shard
+    replay: Replay  # of one shard
 
     def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         """State before the prefill, with an empty replay."""
@@ -35,7 +35,7 @@ class OffPolicyDriver:
 
     @staticmethod
     def layout(seed: Any, environment: Any) -> ReplayState:
-        """What of the replay lies on the axis of seeds alone, and what on that of environments too."""
+        """The mesh axes of each part of the replay."""
         return ReplayState(rows=environment, written=seed)
 
     @staticmethod
@@ -50,11 +50,11 @@ class OffPolicyDriver:
         return jax.eval_shape(self.batch, state.data, bits)
 
     def batch(self, replay: ReplayState, bits: jax.Array) -> Transitions:
-        """A batch of transitions, built from windows of signals, drawn by random bits (B, 2), uint32."""
+        """A batch of transitions built from windows of signals, chosen by random bits (B, 2), uint32."""
         return batch(self.replay, self.environments.env.observer, self.data.discount, replay, bits)
 
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
-        """Random actions, each held for ten steps on average, until the replay holds as many steps as it is to."""
+        """Fill the replay with random actions, each held for ten steps on average."""
         every = self.environments
         steps = self.data.prefill // every.total
         keys_redraw, keys_action, keys_env = every.keys(state, steps, 3)
@@ -70,15 +70,15 @@ class OffPolicyDriver:
         return jax.lax.scan(step, state, (actions, every.each(keys_env)))[0]
 
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """`steps` environment steps (over all environments of all shards) of exploration and learning.
+        """Explore and learn for `steps` environment steps (over all environments of all shards).
 
-        The updates of a step draw from the rows of all steps up to the last but one before it. The replay must hold
-        more than one step.
+        The updates of a step draw from the rows of all steps except the current and the previous one. The replay must
+        hold more than one step.
 
         Returns:
-            The state, and means over the epoch: the agent's metrics, `reward` (a step, with exploration), `diverged`
-            (share of the steps that ended an episode so) and `no_action` (share of actions that were not finite and
-            became zero).
+            The state, and means over the epoch: the agent's metrics, `reward` (per step, with exploration), `diverged`
+            (share of steps at which y diverged) and `no_action` (share of actions that were not finite and became
+            zero).
         """
         every, data = self.environments, self.data
         keys_noise, keys_env, keys_batch, keys_update = every.keys(state, steps // every.total, 4)
@@ -92,8 +92,8 @@ class OffPolicyDriver:
             jax.vmap(lambda key: jax.random.split(key, data.updates))(keys_update),
         )
 
-        # The rows of a step are written, and its successor's batches gathered, as the next one begins: so environments,
-        # updates and batches need nothing of each other within a step, and are made at the same time.
+        # Writing a step's rows is delayed to the next step, and batches are gathered one step ahead. So environments,
+        # updates and batches do not depend on each other within a step, and run at the same time.
         def step(carry: tuple[TrainState, jax.Array, Transitions], xs: Any) -> tuple[Any, dict[str, jax.Array]]:
             state, rows, batches = carry
             normal, keys_env, bits, keys_update = xs
@@ -117,11 +117,11 @@ class OffPolicyDriver:
         return state, metrics if every.shards == 1 else jax.lax.pmean(metrics, AXIS)
 
     def diagnose(self, state: TrainState, params: EnvParams, key: chex.PRNGKey) -> dict[str, jax.Array]:
-        """What tells whether the learning is sound; of the state of all shards, which stays as it is.
+        """Diagnostics of the learning, from the state of all shards, which is not changed.
 
         Returns:
-            What the agent tells of one batch; replay_age: mean age of what is drawn, in environment steps; and
-            `Environments.expectations`.
+            The agent's diagnostics on one batch; replay_age: mean age of sampled transitions, in environment steps;
+            and `Environments.expectations`.
         """
         key_batch, key_update, key_run = jax.random.split(key, 3)
         bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
@@ -132,7 +132,7 @@ class OffPolicyDriver:
 
 
 def step_metrics(taken: Step, finite: jax.Array) -> dict[str, jax.Array]:
-    """Means over environments of reward, divergence and actions that were not finite (E,)."""
+    """Means over the environments of reward, divergence and non-finite actions."""
     return {
         "reward": jnp.mean(taken.plant_reward),
         "diverged": jnp.mean(jnp.where(taken.terminated, 1.0, 0.0)),
@@ -145,9 +145,9 @@ def batch(layout: Replay, observer: Observer, discount: float, replay: ReplaySta
 
     Args:
         layout, replay: the replay.
-        observer: of the observations.
+        observer: builds the observations.
         discount: of the n-step returns.
-        bits: random, (B, 2), uint32.
+        bits: random bits, (B, 2), uint32.
     """
     windows, _ = layout.sample(replay, bits)
 

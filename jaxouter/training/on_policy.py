@@ -1,4 +1,4 @@
-"""The driver of on-policy learners: unroll the present policy, update from what it did, throw that away."""
+"""Driver for on-policy learners: roll out the current policy, update from the experience, discard it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jaxouter.training.off_policy import step_metrics
 
 @dataclass(frozen=True)
 class OnPolicyDriver:
-    """The pure functions of such a training, or of one of its shards. Static and hashable."""
+    """The pure functions of an on-policy training, or of one shard of it. Static and hashable."""
 
     environments: Environments
     agent: Agent
@@ -48,15 +48,15 @@ class OnPolicyDriver:
         return Experience(of(state.obs), action, jax.tree.map(of, extras), scalar, scalar)
 
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
-        """Nothing: such a learner learns from its own actions alone."""
+        """Does nothing: an on-policy learner learns only from its own actions."""
         del params
         return state
 
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """`steps` environment steps (over all environments of all shards), a multiple of an unroll of all of them.
+        """Explore and learn for `steps` environment steps (over all environments of all shards), in whole unrolls.
 
         Returns:
-            The state, and means over the epoch as of `OffPolicyDriver.epoch`.
+            The state, and means over the epoch as in `OffPolicyDriver.epoch`.
         """
 
         def iteration(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -101,5 +101,5 @@ class OnPolicyDriver:
         return state._replace(agent=learned), jax.tree.map(jnp.mean, {**of_updates, **metrics})
 
     def diagnose(self, state: TrainState, params: EnvParams, key: chex.PRNGKey) -> dict[str, jax.Array]:
-        """`Environments.expectations`; of the state of all shards, which stays as it is."""
+        """`Environments.expectations`, from the state of all shards, which is not changed."""
         return self.environments.expectations(key, state, params)

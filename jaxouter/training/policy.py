@@ -15,10 +15,10 @@ from jaxouter.loop.policy import AffineParams
 
 
 class LearnedParams(NamedTuple):
-    """What the learned policy needs to act."""
+    """Parameters of the learned policy."""
 
     actor: Any
-    base: AffineParams  # base law: r~ of a zero action; the middle of the range, or the static prefilter
+    base: AffineParams  # base law, r~ at zero action: the middle of the range, or the static prefilter
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LearnedPolicy:
     def act(
         self, params: LearnedParams, carry: Memory, r: jax.Array, y: jax.Array, key: chex.PRNGKey | None = None
     ) -> tuple[Memory, jax.Array]:
-        """Observe, act, remember; without exploration."""
+        """Observe, act and update the memory; no exploration."""
         del key
         memory, obs = self.observer.observe(carry, r, y)
         r_tilde = self.r_tilde(params.base, r, self.action(params.actor, obs))

@@ -1,10 +1,10 @@
-"""Model-based pretraining: the actor, trained by back-propagation through whole episodes (analytic policy gradient).
+"""Model-based pretraining: train the actor by back-propagation through whole episodes (analytic policy gradient).
 
-`DifferentiableRollout` takes any differentiable plant. `pretrain` gives it one that was identified from a record of r~
-and y alone; `oracle` gives it the plant itself.
+`DifferentiableRollout` takes any differentiable plant. `pretrain` passes a model identified from recorded r~ and y
+alone; the baseline `oracle` passes the plant itself.
 
-The first layer is trained in whitened coordinates of the observation and folded back: consecutive samples of y differ
-little, and the small differences are what tells the state of the plant.
+The first layer is trained on whitened observations, and the whitening is then folded into it: consecutive samples of y
+differ little, but these small differences carry the state of the plant.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
-RATE = 3e-3  # learning rate at first
-CLIP = 0.1  # of the gradient's norm; below what is usual, so that a batch in which the loop was unstable counts no more
+RATE = 3e-3  # initial learning rate
+CLIP = 0.1  # bound on the gradient's norm; lower than usual, so that a batch with an unstable loop counts no more
 CHUNK = 50  # gradient steps between two reports
-LAST, COLLAPSED = 5, 2.0  # where these steps' mean reward is so many times the best one, the loop has become unstable
-SHORT = 1 / 3  # of the gradient steps, with episodes no longer than the plant's
-CUT, GROWTH = 0.5, 1.25  # by what the learning rate is multiplied where the loop has become unstable, and where not
-FLOOR = 1e-2  # of the standard deviations by which the observation is whitened
-EPISODES = "episodes"  # the axis over which devices share them
+LAST, COLLAPSED = 5, 2.0  # the loop has become unstable if the last 5 steps' mean cost is twice the best one
+SHORT = 1 / 3  # first share of the gradient steps, with episodes no longer than the plant's
+CUT, GROWTH = 0.5, 1.25  # factors on the learning rate after a chunk that became unstable, and after one that did not
+FLOOR = 1e-2  # least standard deviation in the whitening
+EPISODES = "episodes"  # axis over which devices share the episodes
 
 
 class PretrainingState(NamedTuple):
-    """The state of a rehearsal: all that its next gradient steps depend on."""
+    """State of a pretraining: everything that its next gradient steps depend on."""
 
-    before: Any  # whitened actors and optimiser state, each leaf (1, ...), of one report before
-    now: Any  # the same, now
-    best: Any  # mean reward
-    rate_scale: Any  # share of the learning rate that the next steps take, at most 1
-    done: Any  # int32, gradient steps
+    before: Any  # whitened actors and optimiser state, each leaf (1, ...), one report ago
+    now: Any  # the current ones
+    best: Any  # best mean reward
+    rate_scale: Any  # factor on the learning rate of the next steps, at most 1
+    done: Any  # int32, gradient steps so far
 
     @classmethod
     def begin(cls, actor: Any) -> PretrainingState:
-        """Before the first step, from an actor whose first layer takes the whitened observation."""
+        """State before the first step, from an actor whose first layer takes the whitened observation."""
         actors = jax.tree.map(lambda leaf: leaf[None], actor)
         carry = actors, jax.vmap(ADAM.init)(actors)
         return cls(carry, carry, jnp.asarray(-np.inf, float), jnp.ones((), float), np.int32(0))
 
 
 Report = Callable[[PretrainingState, Callable[[], Any]], None]
-"""Told now and then how far a rehearsal is, and how to get the actor of that time."""
+"""`report(at, actor)`: called now and then with the state of the pretraining, and a function that gives its actor."""
 Say = Callable[[str, int, int], None]
-"""Told what is going on, recording or compiling, how much of it is done and of how much: 0 of 0 where nobody knows."""
+"""`say(what, done, of)`: called with the phase ("recording", "compiling") and its progress; 0 of 0 if unknown."""
 
 
 class Whitening(NamedTuple):
@@ -74,30 +74,30 @@ class Whitening(NamedTuple):
 
 @dataclass(frozen=True)
 class DifferentiableRollout:
-    """Episodes of the training distribution, as a differentiable function. Static and hashable."""
+    """Training episodes as a differentiable function. Static and hashable."""
 
     plant: Plant
     policy: LearnedPolicy
     batch: int = 64
-    """Episodes a gradient step (and seed)."""
+    """Episodes per gradient step (and seed)."""
     noise: float = 0.0
-    """Largest standard deviation of the measurement noise, in half of the episodes; 1 is half the set-point range."""
+    """Largest standard deviation of measurement noise, in half of the episodes; 1 is half the set-point range."""
     load: float = 0.0
-    """Largest unseen step of r~, at a random time in half of the episodes; 1 is half the range of r~."""
+    """Largest load (unseen step added to r~ at a random time), in half of the episodes; 1 is half the r~ range."""
     log_above: float = 0.0
-    """Cost a step above which episodes count by its logarithm; 0: all count in full."""
+    """c > 0: a cost per step counts as c log(1 + cost / c); 0: it counts in full."""
     devices: int = 1
-    """Of this process, which share the episodes of a gradient step evenly."""
+    """Devices of this process that share the episodes of a gradient step evenly."""
 
     @classmethod
     def of(
         cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int, devices: int = 1
     ) -> DifferentiableRollout:
-        """The roll-out with the disturbances and the cost of a configuration, on as many devices as share a batch."""
+        """The roll-out as configured, on as many of the devices as can share a batch evenly."""
         return cls(plant, policy, batch, config.noise, config.load, config.log_above, math.gcd(batch, devices))
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
-        """One episode: mean reward a step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
+        """One episode: mean reward per step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
         plant, steps = self.plant, self.plant.episode_steps
         key_draw, key_start, key_r, key_run, key_smooth, key_noise, key_load = jax.random.split(key, 7)
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
@@ -129,7 +129,7 @@ class DifferentiableRollout:
         return self.noise * self.policy.observer.y_scale * level * jax.random.normal(key_run, (steps,), float)
 
     def _load(self, key: chex.PRNGKey, steps: int) -> jax.Array:
-        """What is added to r~ (steps,): nothing, from a random time on a constant."""
+        """Load on r~ (steps,): zero, then constant from a random time on."""
         low, high = self.plant.r_tilde_bounds
         since, size = jax.random.uniform(key, (2,), float, -1.0, 1.0)
         step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
@@ -137,7 +137,7 @@ class DifferentiableRollout:
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def whitening(self, base: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
-        """From the observations under an actor whose action is zero."""
+        """Whitening of the observations under a zero action."""
         zero = jax.tree.map(jnp.zeros_like, self.policy.init_actor(key))
 
         def observed(key: chex.PRNGKey) -> jax.Array:
@@ -152,16 +152,16 @@ class DifferentiableRollout:
     def train(
         self, carry: Any, white: Whitening, base: AffineParams, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
     ) -> tuple[Any, jax.Array]:
-        """Gradient steps with the given rates (n,), on fresh episodes each.
+        """Gradient steps with the given rates (n,), each on fresh episodes.
 
         Args:
             carry: whitened actors and optimiser state, each leaf (seeds, ...).
             white, base, plant_params: the same for all seeds.
             rates: learning rates.
-            key: episodes, the same for all seeds.
+            key: for the episodes, which are the same for all seeds.
 
         Returns:
-            carry, and the mean reward that each step began with, as it counts (n, seeds).
+            carry, and the mean reward before each step, with `log_above` applied (n, seeds).
         """
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
@@ -171,7 +171,7 @@ class DifferentiableRollout:
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
             cost, gradient = of_all(jax.value_and_grad(loss)(actor, keys))
-            finite = jnp.isfinite(optax.tree.norm(gradient))  # else nothing is learned from these episodes
+            finite = jnp.isfinite(optax.tree.norm(gradient))  # if not, skip these episodes
             gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
             with jax.numpy_dtype_promotion("standard"):  # optax's Adam raises a float to an integer power
                 step, state = ADAM.update(gradient, state)
@@ -201,7 +201,7 @@ ADAM = optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam())
 
 
 def folded(actor: Any, white: Whitening) -> Any:
-    """The actor in terms of the observation, from one whose first layer takes the whitened one."""
+    """The actor on plain observations, from one whose first layer takes whitened ones."""
     layers = actor["params"]
     first = min(layers)
     kernel = white.matrix @ layers[first]["kernel"]
@@ -226,19 +226,22 @@ def pretrain(
     devices: int = 1,
     say: Say = lambda what, done, of: None,
 ) -> Any:
-    """The actor after so many gradient steps on a plant that is identified from recorded episodes.
+    """Pretrain an actor on a plant model that is identified from recorded episodes.
 
-    One that is already made of models from a record is not identified once more.
+    A plant that consists of identified models is used directly.
 
     Args:
-        config: how many of both.
-        plant, plant_params: only recorded from, through r~ and y.
-        policy, learned: what to begin with; an actor whose first layer takes the whitened observation.
+        config: numbers of episodes and gradient steps, among others.
+        plant, plant_params: only recorded, through r~ and y.
+        policy, learned: the policy and its initial parameters; the actor's first layer takes whitened observations.
         key: random numbers.
-        report: called now and then with the rehearsal so far, and with what gives its actor.
-        begin: where a rehearsal with the same arguments was stopped; None: at its beginning.
-        devices: of this process, which share the episodes of a gradient step.
-        say: called with what is going on.
+        report: see `Report`.
+        begin: state from which to resume a pretraining with the same arguments; None: from its start.
+        devices: of this process, to share the episodes of a gradient step.
+        say: see `Say`.
+
+    Returns:
+        The actor's parameters, for plain observations.
     """
     key_record, *keys = jax.random.split(key, 3)
     if plant.identified:
@@ -269,21 +272,21 @@ def pretrain_on(
     devices: int = 1,
     say: Say = lambda what, done, of: None,
 ) -> Any:
-    """The actor after so many gradient steps on a differentiable plant, of which each episode is a draw.
+    """Pretrain an actor on a differentiable plant, of which each episode is a draw.
 
-    What is unstable shows late, but can be won only by who holds the rest: where the configuration has episodes longer
-    than the plant's, they come last. Gradients through a loop that has become unstable lead nowhere: where that
-    happened, training goes on, with other episodes and at half the rate, from where it was two reports before; the rate
-    grows again while that goes well.
+    Instability may show only late in an episode, but long episodes help only an actor that already controls short ones.
+    So if longer episodes than the plant's are configured, they come last. Gradients through an unstable loop are
+    useless: if the loop becomes unstable, training returns to the state two reports ago, and continues with other
+    episodes and half the learning rate, which grows again while all is well.
 
     Args:
-        config, policy, learned, report, begin, devices, say: as of `pretrain`.
+        config, policy, learned, report, begin, devices, say: as for `pretrain`.
         plant, plant_params: with the plant's own length of an episode.
-        keys: two, of the whitening and of the episodes.
+        keys: two, for the whitening and for the episodes.
     """
     key_white, key_run = keys
     base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices)]
-    longer = config.gradient_steps  # from this step on
+    longer = config.gradient_steps  # first step with longer episodes
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
         stages.append(replace(stages[0], plant=replace(plant, episode_steps=config.episode_steps)))
@@ -296,10 +299,10 @@ def pretrain_on(
 
     while (done := int(at.done)) < config.gradient_steps:
         chunk, stage = at.rate_scale * rates[done : done + CHUNK], stages[done >= longer]
-        if done == longer:  # for longer episodes, anew
+        if done == longer:  # longer episodes compile again
             say("compiling", 0, 0)
         found = stage.train(at.now, white, base, plant_params, chunk, jax.random.fold_in(key_run, done))
-        carry, reward = jax.device_get(found)  # not left on several devices: what comes in so is compiled for anew
+        carry, reward = jax.device_get(found)  # inputs on several devices would compile again
         reward = reward[:, 0]
         first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
         best = first if done == longer else max(float(at.best), first)

@@ -1,4 +1,4 @@
-"""What a training run will take, before any of it: shapes, memory and arithmetic. Nothing is compiled."""
+"""Resources of a training run, estimated before it starts: shapes, memory and arithmetic. Nothing is compiled."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from jaxouter.training.trainer import Trainer, build
 
 
 class Resources(NamedTuple):
-    """What a run takes."""
+    """Resources of a run."""
 
     lines: list[tuple[str, str]]
-    """Quantity and value, for people."""
+    """(quantity, value) as text."""
     memory: int
-    """Bytes, about, without what JAX and compiled functions take."""
+    """Approximate bytes, without JAX itself and compiled functions."""
 
     def check(self) -> None:
-        """Raises ValueError where the machine has less memory."""
+        """Raises ValueError if the machine has less memory."""
         there = _there()
         if self.memory > there:
             raise ValueError(
@@ -41,10 +41,10 @@ class Resources(NamedTuple):
 
 
 def resources(config: TrainConfig) -> Resources:
-    """What a run of a configuration takes.
+    """Resources of a run with this configuration.
 
     Raises:
-        ValueError: the configuration does not fit together.
+        ValueError: the configuration is inconsistent.
     """
     trainer, params = build(config)
     observer, start = trainer.env.observer, config.pretraining
@@ -64,20 +64,20 @@ def resources(config: TrainConfig) -> Resources:
     lines += [
         (
             "control steps",
-            f"{config.environment_steps:,} a seed, {config.identification_steps:,} of them recorded first",
+            f"{config.environment_steps:,} per seed, {config.identification_steps:,} of them recorded first",
         ),
-        ("updates", f"{config.total_updates:,} a seed in {config.epochs:,} epochs"),
+        ("updates", f"{config.total_updates:,} per seed in {config.epochs:,} epochs"),
         *((f"memory, {name}", _bytes(size)) for name, size in parts.items()),
-        ("memory of a seed, and a checkpoint", _bytes(whole)),
+        ("memory per seed, and per checkpoint", _bytes(whole)),
     ]
     here = -(-config.seeds // jax.process_count())
-    # Random numbers of an epoch, drawn before it; of off-policy learners those by which batches are drawn, twice.
+    # Random numbers of an epoch are drawn before it; off-policy learners hold those for drawing batches twice.
     data, rounds = config.agent.data, config.epoch // config.environments
     drawn = 16 * rounds * getattr(data, "updates", 1) * getattr(data, "batch_size", 1)
-    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more on its way to the disk
+    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more while it is being saved
     if start.gradient_steps:
         steps = start.episode_steps or trainer.env.plant.episode_steps
-        # Of the activations that back-propagation through an episode keeps, XLA was seen to allocate two thirds.
+        # Back-propagation keeps activations of the whole episode; XLA was seen to allocate two thirds of them.
         activations = observer.size + 2 * sum(config.agent.hidden) + 4 * (start.lags or observer.history)
         kept = 4 * start.batch_size * steps * activations
         memory += kept
@@ -90,7 +90,7 @@ def resources(config: TrainConfig) -> Resources:
 
 
 def arithmetic(config: TrainConfig) -> tuple[float, float]:
-    """FLOP of a gradient step of the pretraining, and of an update, as the compiler counts them; nan: there is none."""
+    """FLOP per gradient step of the pretraining and per update, as the compiler counts them; nan if there are none."""
     trainer, params = build(config)
     state = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
     update = math.nan
@@ -101,18 +101,18 @@ def arithmetic(config: TrainConfig) -> tuple[float, float]:
 
 
 def arithmetic_lines(config: TrainConfig) -> list[tuple[str, str]]:
-    """The same for people."""
+    """The same as text."""
     counts = config.pretraining.gradient_steps, config.total_updates
     named = zip(("pretraining", "updates"), arithmetic(config), counts, strict=True)
     return [
-        (f"arithmetic, {name}", f"{flop / 1e6:,.0f} MFLOP each, {flop * count:.2g} FLOP a seed")
+        (f"arithmetic, {name}", f"{flop / 1e6:,.0f} MFLOP each, {flop * count:.2g} FLOP per seed")
         for name, flop, count in named
         if math.isfinite(flop)
     ]
 
 
 def _gradient_step(trainer: Trainer, params: EnvParams, state: TrainState) -> float:
-    """FLOP of back-propagation through a batch of episodes: those of one control step, times their number."""
+    """FLOP of back-propagation through a batch of episodes: those of one control step times the number of steps."""
     start, plant, model = trainer.config.pretraining, trainer.env.plant, params.plant
     steps = start.episode_steps or plant.episode_steps
     if not plant.identified:
@@ -132,13 +132,13 @@ def _gradient_step(trainer: Trainer, params: EnvParams, state: TrainState) -> fl
 
 
 def _flop(function: Any, *shapes: Any) -> float:
-    """FLOP of a call, by the compiler's analysis of what it has not yet compiled."""
+    """FLOP of a call, by the compiler's cost analysis before compilation."""
     found = jax.jit(function).lower(*shapes).cost_analysis()
     return float((found or {}).get("flops", math.nan))
 
 
 def _there() -> float:
-    """Bytes of memory of the machine, or of the container where that has less; inf where nothing tells it."""
+    """Bytes of memory of the machine, or of the container if that has less; inf if unknown."""
     limits = [math.inf]
     with suppress(AttributeError, OSError, ValueError):  # Windows has no sysconf
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

@@ -1,4 +1,4 @@
-"""The run folder: config.json, summary.json, figures, and for each seed its metrics and checkpoints."""
+"""The run folder: config.json, summary.json, figures, and the metrics and checkpoints of each seed."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.trainer import Trainer, build
 
 FORMAT = 1
-RUNS = Path("runs")  # where a run goes that is told no other place
-KEEP = 2  # checkpoints of each seed
-SAVED = ("checkpoint-*.npz", "pretraining.npz")  # what a seed can go on from
+RUNS = Path("runs")  # default parent of run folders
+KEEP = 2  # checkpoints per seed
+SAVED = ("checkpoint-*.npz", "pretraining.npz")  # files that a seed can resume from
 
 
 class RunWarning(UserWarning):
-    """What users of a run folder should know: a file is damaged and another used in its place, its plant changed."""
+    """A problem with a run folder: a damaged file was replaced by another, or the plant has changed."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A folder and the configuration in it."""
+    """A run folder and its configuration."""
 
     path: Path
     config: TrainConfig
 
     @classmethod
     def create(cls, config: TrainConfig, out: Path | None) -> Run:
-        """A new folder; `out` None: runs/PLANT-PRESET-SEED, with -2, -3, ... where that exists.
+        """Make a new folder; `out` None: runs/PLANT-PRESET-SEED, with -2, -3, ... if that exists.
 
         Raises:
             ValueError: `out` exists or can't be made.
@@ -74,22 +74,22 @@ class Run:
                 for seed in run.seeds:
                     run.seed_folder(seed).mkdir()
                 made.chmod(0o755)
-                made.rename(path)  # whole or not at all: it is a run from its first moment on
+                made.rename(path)  # atomic: a folder of this name is always a complete run
             except OSError as error:
                 if made is not None:
                     shutil.rmtree(made, ignore_errors=True)
-                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # made by another process meanwhile
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process has made it meanwhile
                     continue
                 raise ValueError(f"the folder {path} can't be made: {error.strerror}") from None
             return cls(path, config)
-        raise ValueError(f"{candidates[0]} exists; choose another --out, or go on with it by --resume {candidates[0]}")
+        raise ValueError(f"{candidates[0]} exists; choose another --out, or resume it with --resume {candidates[0]}")
 
     @classmethod
     def open(cls, path: Path) -> Run:
-        """The run in a folder that `create` made.
+        """Open a folder that `create` made.
 
         Raises:
-            ValueError: it is no run, or one of another format.
+            ValueError: it is not a run, or of another format.
         """
         config, was = _read(path)
         run = cls(path, config)
@@ -99,26 +99,26 @@ class Run:
                 "never imported because a run folder names it, so name this plant on the command line"
             )
         if name in REGISTRATIONS and was.get("sha256") != REGISTRATIONS[name].sha256:
-            message = f"{path}: {REGISTRATIONS[name].reference} is not what it was when the run was made"
+            message = f"{path}: {REGISTRATIONS[name].reference} has changed since the run was made"
             warnings.warn(message, RunWarning, stacklevel=2)
         return run
 
     @contextmanager
     def gone_if_nothing_is_learned(self) -> Iterator[None]:
-        """The folder, new, is removed where the block fails before anything was saved in it."""
+        """Remove the new folder if the block fails before anything is saved in it."""
         try:
             yield
         except BaseException:
             folders = list(map(self.seed_folder, self.seeds))
             if not any(path for folder in folders for name in SAVED for path in folder.glob(name)):
                 shutil.rmtree(self.path, ignore_errors=True)
-                with suppress(OSError):  # other runs are in it
+                with suppress(OSError):  # it holds other runs
                     if self.path.parent == RUNS:
                         RUNS.rmdir()
             raise
 
     def changes(self) -> list[str]:
-        """What the results depend on and is no longer what it was when the run was made."""
+        """Changes, since the run was made, of versions, device and flags that results depend on."""
         before, now = json.loads((self.path / "config.json").read_text()), surroundings(self.config)
         pairs = []
         for group, values in now.items():
@@ -134,7 +134,7 @@ class Run:
 
     @property
     def figures(self) -> Path:
-        """Where the pictures go."""
+        """Folder for figures."""
         return self.path / "figures"
 
     def seed_folder(self, seed: int) -> Path:
@@ -148,35 +148,35 @@ class Run:
 
     @property
     def drawn(self) -> tuple[Ranges, float]:
-        """The numbers of the plant that training drew, and the largest standard deviation of its measurement noise."""
+        """Ranges of the plant's parameters in training, and the largest standard deviation of measurement noise."""
         return self.config.randomise, self.config.pretraining.noise * self.trainer[0].env.observer.y_scale
 
     @cached_property
     def fleet(self) -> Fleet:
-        """The trainer over the devices of the configuration."""
+        """The trainer on the configured devices."""
         return Fleet.of(self.config)
 
     def checkpoints(self, seed: int) -> dict[int, Path]:
-        """Checkpoints of a seed by the number of epochs, oldest first."""
+        """Checkpoints of a seed by number of epochs, oldest first."""
         paths = sorted(self.seed_folder(seed).glob("checkpoint-*.npz"))
         return {int(path.stem.removeprefix("checkpoint-")): path for path in paths}
 
     def whole(self, seed: int) -> dict[int, Path]:
-        """The checkpoints of a seed that are not damaged; warns of each that is."""
+        """The undamaged checkpoints of a seed; warns of each damaged one."""
         found = self.checkpoints(seed)
         for epoch, path in list(found.items()):
             try:
                 checkpoint.read(path)
             except ValueError as error:
-                warnings.warn(f"{error}; it is left out", RunWarning, stacklevel=2)
+                warnings.warn(f"{error}; it is ignored", RunWarning, stacklevel=2)
                 del found[epoch]
         return found
 
     def common_epoch(self) -> int:
-        """The newest epoch of which every seed has a whole checkpoint, where all go on together; 0 at the beginning.
+        """The newest epoch of which every seed has an undamaged checkpoint, to resume from; 0: from the start.
 
         Raises:
-            ValueError: there is none, although some seed is further than the first epoch.
+            ValueError: there is none, although a seed is past the first epoch.
         """
         kept = {seed: set(self.whole(seed)) for seed in self.seeds}
         common = set.intersection(*kept.values())
@@ -186,21 +186,21 @@ class Run:
         return max(common, default=0)
 
     def save(self, seed: int, epoch: int, state: TrainState) -> None:
-        """Checkpoint after so many epochs; old ones are removed.
+        """Save a checkpoint after `epoch` epochs, and remove old ones.
 
         Raises:
-            OSError: it can't be written; the old ones are there.
+            OSError: it can't be written; the old ones are kept.
         """
         path, rows = self.seed_folder(seed) / f"checkpoint-{epoch:06d}.npz", self.seed_folder(seed) / "metrics.jsonl"
         if rows.exists():
             with rows.open("rb+") as file:
-                os.fsync(file.fileno())  # before what goes on after them
+                os.fsync(file.fileno())  # rows must reach the disk before the checkpoint that follows them
         checkpoint.save(path, state, seed=seed, epoch=epoch)
         for old in list(self.checkpoints(seed).values())[:-KEEP]:
             old.unlink()
 
     def load(self, seed: int, epoch: int | None = None) -> tuple[TrainState, int]:
-        """State and number of epochs of the checkpoint after so many epochs; None: the newest that is whole.
+        """State and number of epochs of a checkpoint; `epoch` None: the newest undamaged one.
 
         Raises:
             ValueError: there is none, or it is not readable.
@@ -216,7 +216,7 @@ class Run:
         return state, header["epoch"]
 
     def policy(self, seed: int) -> tuple[LearnedPolicy, LearnedParams]:
-        """The policy of a seed, without exploration, from its newest whole checkpoint.
+        """The policy of a seed, without exploration, from its newest undamaged checkpoint.
 
         Raises:
             ValueError: there is none, or it is not readable.
@@ -225,15 +225,15 @@ class Run:
         return trainer.policy, trainer.policy_params(self.load(seed)[0])
 
     def save_pretraining(self, seed: int, at: PretrainingState) -> None:
-        """Keep how far the pretraining of a seed is, until there is a checkpoint.
+        """Save the state of a seed's pretraining, until there is a checkpoint.
 
         Raises:
-            OSError: it can't be written; the one before is there.
+            OSError: it can't be written; the previous one is kept.
         """
         checkpoint.save(self._pretraining(seed), at, seed=seed)
 
     def load_pretraining(self, seed: int) -> PretrainingState | None:
-        """How far the pretraining of a seed is; None: at its beginning. Warns where what was kept is damaged."""
+        """The saved state of a seed's pretraining; None: there is none. Warns if it is damaged."""
         path = self._pretraining(seed)
         if not path.exists():
             return None
@@ -242,11 +242,11 @@ class Run:
             actor = jax.eval_shape(trainer.policy.init_actor, jax.random.key(0))
             return checkpoint.load(path, jax.eval_shape(PretrainingState.begin, actor))[0]
         except ValueError as error:
-            warnings.warn(f"{error}; the pretraining begins anew", RunWarning, stacklevel=2)
+            warnings.warn(f"{error}; the pretraining starts over", RunWarning, stacklevel=2)
             return None
 
     def forget_pretraining(self) -> None:
-        """Drop what was kept of the pretraining."""
+        """Delete the saved states of the pretraining."""
         for seed in self.seeds:
             self._pretraining(seed).unlink(missing_ok=True)
 
@@ -254,7 +254,7 @@ class Run:
         return self.seed_folder(seed) / "pretraining.npz"
 
     def median_seed(self) -> int:
-        """The seed with the median MAE on the first of the paper's scenarios; before there is a summary the first."""
+        """The seed with the median MAE on the first of the paper's scenarios; without a summary, the first seed."""
         path = self.path / "summary.json"
         if not path.exists():
             return self.config.seed
@@ -265,7 +265,7 @@ class Run:
             raise ValueError(f"{path} is damaged: it names no median seed of {seeds}") from None
 
     def verdict(self) -> dict[str, Any]:
-        """What summary.json says of the learned policies on fresh training episodes; nothing before, or if older."""
+        """The verdict on the learned policies in summary.json; empty if there is none."""
         try:
             found = json.loads((self.path / "summary.json").read_text())["verdict"]
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -273,7 +273,7 @@ class Run:
         return found if isinstance(found, dict) else {}
 
     def rows(self, seed: int) -> list[dict[str, Any]]:
-        """Rows of metrics.jsonl, one an epoch; a last one that was not written to its end is none.
+        """Rows of metrics.jsonl, one per epoch; an incomplete last line is ignored.
 
         Raises:
             ValueError: another line is not readable.
@@ -289,16 +289,16 @@ class Run:
         return rows
 
     def append(self, seed: int, row: dict[str, Any]) -> None:
-        """One row more."""
+        """Append a row."""
         with (self.seed_folder(seed) / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(row) + "\n")
 
     def forget(self, seed: int, epoch: int) -> None:
-        """Drop rows and checkpoints after so many epochs: those of epochs that will run again."""
+        """Delete rows and checkpoints after `epoch`; these epochs will run again."""
         for later, path in self.checkpoints(seed).items():
             if later > epoch:
                 path.unlink()
-        for partial in self.seed_folder(seed).glob("*.partial"):  # left by a kill
+        for partial in self.seed_folder(seed).glob("*.partial"):  # left when a run was killed
             partial.unlink()
         rows = [json.dumps(row) + "\n" for row in self.rows(seed) if row["epoch"] <= epoch]
         checkpoint.write(self.seed_folder(seed) / "metrics.jsonl", "".join(rows).encode())
@@ -306,10 +306,10 @@ class Run:
 
 @contextmanager
 def lock(path: Path) -> Iterator[None]:
-    """The folder for this process alone to write, until the block or the process ends.
+    """Lock the folder for this process, until the block or the process ends.
 
     Raises:
-        ValueError: another process has it.
+        ValueError: another process has locked it.
     """
     holder, lock = path / "process", FileLock(path / "lock", timeout=0)
     try:
@@ -319,7 +319,7 @@ def lock(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is being trained by process {number}; wait for its end, or stop it") from None
     except OSError as error:
         raise ValueError(f"{path} can't be locked: {error.strerror}") from None
-    with suppress(OSError):  # on a full disk the number of the process is not told
+    with suppress(OSError):  # on a full disk, do without the process number
         holder.write_text(str(os.getpid()))
     try:
         yield
@@ -328,10 +328,10 @@ def lock(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration of a run, and where its plant was from.
+    """The configuration of a run, and the origin of its plant.
 
     Raises:
-        ValueError: the folder is no run, or one of another format.
+        ValueError: the folder is not a run, or of another format.
     """
     try:
         content = json.loads((path / "config.json").read_text())
@@ -348,10 +348,10 @@ def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 def add_plant(reference: str, path: Path | None) -> str:
-    """Short name of the plant that a command line names, made with the options of the run in a folder (or of a seed).
+    """Register the plant that a command line names, with the options of the run in a folder; returns its short name.
 
     Raises:
-        ValueError: there is no such plant, or the folder is no run.
+        ValueError: there is no such plant, or the folder is not a run.
     """
     if path is None:
         return add(reference)
@@ -360,7 +360,7 @@ def add_plant(reference: str, path: Path | None) -> str:
 
 
 def add_agent(reference: str | None) -> str | None:
-    """Make the agent that a command line names, if any, known, and give its name: a registered one, or FILE.py:CLASS.
+    """Register the agent that a command line names, if any, and return its name: a registered one, or FILE.py:CLASS.
 
     The class is the agent's settings, see `jaxouter.agents.AgentConfig`.
 
@@ -380,15 +380,15 @@ def add_agent(reference: str | None) -> str | None:
 
 
 def own_agents() -> tuple[str, ...]:
-    """References of the agents that were added."""
+    """References of agents given as FILE.py:CLASS."""
     return tuple(name for name in AGENTS if ".py:" in name)
 
 
 def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
-    """The run in a folder, its median seed and all its seeds; of the folder of one seed that one alone.
+    """The run in a folder, its median seed and all its seeds; for the folder of one seed, only that seed.
 
     Raises:
-        ValueError: the folder is no run.
+        ValueError: the folder is not a run.
     """
     name = path.resolve().name
     if name.startswith("seed-") and not (path / "config.json").exists():
@@ -402,7 +402,7 @@ def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
 
 
 def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
-    """What a result depends on beside the configuration; with one also where its plant is from, unless built in."""
+    """What results depend on besides the configuration; given one, also the origin of its plant if not built in."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")
     device = jax.devices()[0]
     source = None if config is None else REGISTRATIONS.get(config.plant)
@@ -415,9 +415,9 @@ def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON, whole or not at all.
+    """Write JSON atomically.
 
     Raises:
-        OSError: it can't be written; `path` is as it was.
+        OSError: it can't be written; `path` is unchanged.
     """
     checkpoint.write(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -10,7 +10,7 @@ from jaxouter.training.run import Run
 
 
 def require() -> None:
-    """Raises ValueError where tensorboardX is not installed."""
+    """Raises ValueError if tensorboardX is not installed."""
     try:
         import tensorboardX  # noqa: F401
     except ImportError:
@@ -18,13 +18,13 @@ def require() -> None:
 
 
 class Events:
-    """Writes each row of a run as it comes, into the folder of its seed, without a thread that could fail unheard."""
+    """Writes the rows of a run to the folder of their seed. No background thread, whose errors would be lost."""
 
     def __init__(self, run: Run) -> None:
         self._run, self._writers = run, {}
 
     def __call__(self, seed: int, row: Mapping[str, Any]) -> None:
-        """One row, over its environment steps; with the first one all that the run has, so that none is there twice.
+        """Write a row, at its environment steps. The first call rewrites all rows of the run, so that none is double.
 
         Raises:
             OSError: it can't be written.

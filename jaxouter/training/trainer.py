@@ -1,7 +1,7 @@
-"""The trainer: a configuration as pure functions, which start a training and carry it on, epoch by epoch.
+"""The trainer: a configuration as pure functions that start a training and continue it, epoch by epoch.
 
-Everything that training changes is one pytree, `TrainState`; `prefill` and `epoch` are pure functions of it, jitted and
-donated. Plain Python between them draws progress, evaluates and saves (`jaxouter.training.epochs`).
+The state is one pytree, `TrainState`; `prefill` and `epoch` are jitted pure functions of it, and it is donated. Plain
+Python in between shows progress, evaluates and saves (`jaxouter.training.epochs`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ DIAGNOSIS = 2  # likewise
 
 @dataclass(frozen=True)
 class Trainer:
-    """The pure functions of one training run, or of one of the shards of its learner. Static and hashable."""
+    """The pure functions of one training run, or of one shard of its learner. Static and hashable."""
 
     config: TrainConfig
     environments: Environments
@@ -49,16 +49,16 @@ class Trainer:
 
     @property
     def policy(self) -> LearnedPolicy:
-        """What acts, without exploration."""
+        """The policy, without exploration."""
         return self.environments.policy
 
     @property
     def agent(self) -> Agent:
-        """What learns."""
+        """The learner."""
         return self.environments.agent
 
     def policy_params(self, state: TrainState) -> LearnedParams:
-        """What the policy has learned so far."""
+        """The current parameters of the policy."""
         return self.environments.policy_params(state)
 
     def updates(self, state: TrainState) -> int:
@@ -76,10 +76,15 @@ class Trainer:
     ) -> TrainState:
         """State before the prefill.
 
-        The static prefilter is identified where it is the policy's base law, and the actor pretrained where that is
-        configured, on so many devices of this process, from where the pretraining of the same seed was stopped or from
-        its beginning; `report` is called with the pretraining so far, and with what gives the state with its actor;
-        `say` with what is going on.
+        Identifies the static prefilter if it is the policy's base law, and pretrains the actor if configured.
+
+        Args:
+            seed, params: of the training; of the environments.
+            report: called with the state of the pretraining, and a function that gives the training state with its
+                actor.
+            begin: state from which to resume the pretraining of this seed; None: from its start.
+            devices: of this process, for the pretraining.
+            say: see `Say`.
 
         Raises:
             ValueError: the identification failed.
@@ -98,10 +103,10 @@ class Trainer:
             def with_actor(actor: Any) -> TrainState:
                 return state._replace(agent=self.agent.with_actor(state.agent, actor))
 
-            def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
+            def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
                 report(at, lambda: with_actor(actor()))
 
-            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, heard, begin, devices, say)
+            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, reported, begin, devices, say)
             state = with_actor(actor)
         return state
 
@@ -115,25 +120,25 @@ class Trainer:
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
-        """What is done before the first epoch, see the driver."""
+        """Runs before the first epoch; see the driver."""
         return self.driver.prefill(state, params)
 
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """`steps` environment steps of exploration and learning, see the driver."""
+        """Explore and learn for `steps` environment steps; see the driver."""
         return self.driver.epoch(state, params, steps)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
-        """What tells whether the learning is sound, see the driver; the state stays as it is."""
+        """Diagnostics of the learning; see the driver. The state is not changed."""
         return self.driver.diagnose(state, params, jax.random.fold_in(state.key, DIAGNOSIS))
 
 
 def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
-    """The trainer of a configuration (of one of so many shards of it), and the parameters of its environments.
+    """The trainer of a configuration (or of one of `shards` shards), and the parameters of its environments.
 
     Raises:
-        ValueError: the configuration does not fit together.
+        ValueError: the configuration is inconsistent.
     """
     plant, _ = make_plant(config.check().plant)
     env, params = environment.make(
@@ -147,7 +152,7 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
     lags, most = start.lags or env.observer.history, (start.episode_steps or plant.episode_steps) // 2
     if start.gradient_steps and lags > most:
         raise ValueError(f"pretraining.lags is {lags}; it must be at most half a recorded episode, {most}")
-    # The functions are the same for all seeds, and compiled once.
+    # The functions are the same for all seeds, so they are compiled once.
     config = replace(config, seed=0, seeds=1, devices=1)
     agent = config.agent.build(env.observer.size, config.total_updates, AXIS if shards > 1 else None)
     environments = Environments(
@@ -163,12 +168,12 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
 
 
 def driver(config: TrainConfig, environments: Environments) -> OffPolicyDriver | OnPolicyDriver:
-    """The driver for the kind of data that the agent learns from."""
+    """The driver for the agent's kind of data."""
     agent, data = environments.agent, environments.agent.data
     if not isinstance(data, OffPolicy):
         return OnPolicyDriver(environments, agent, data)
     history = environments.env.observer.history
-    # The replay never holds more than there is, and little where nothing is learned from it.
+    # The replay is no larger than the training is long, and small if nothing is learned from it.
     least = 2 * (history + data.n_step)
     per_environment = max(least, min(data.replay, config.steps) // config.environments)
     replay = Replay(FIELDS, environments.count, per_environment, history, data.n_step)

@@ -2,10 +2,10 @@
 
     PYTHONPATH=. $(bash scripts/peers.sh) scripts/examples/sb3.py
 
-It begins with a record of random r~, each held for a second or so, since DDPG that starts from nothing saturates for
-long; then it makes as many updates as environment steps, a minute on 2 cores. It prints the mean of |r - y| over
-episodes that it never saw, and ends with status 1 if what it learned is not better than both the untrained actor and
-the inner loop alone. `make_vec` steps all episodes of the record and of the evaluation at once.
+The replay is first filled under random r~, each held for about a second, since DDPG from scratch saturates for long.
+Then it makes as many updates as environment steps, a minute on 2 cores. It prints the mean of |r - y| over held-out
+episodes, and exits with status 1 if the learned policy is not better than both the untrained actor and the inner loop
+alone. `make_vec` steps all episodes at once.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from jaxouter import plants
 
 ID = "jaxouter/Pitch-v0"
 ENVIRONMENTS = 16
-RECORDED = 1000  # steps of each
-EPISODES = 64
-HELD_OUT = 10_000  # their first seed
-REWARD_SCALE = 0.1  # so that what the critic has to learn is of the order of 1 to 10
+RECORDED = 1000  # random steps of each
+EPISODES = 64  # of the evaluation
+HELD_OUT = 10_000  # first seed of the evaluation
+REWARD_SCALE = 0.1  # brings the critic's values to the order of 1 to 10
 
 Choose = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def mae(choose: Choose) -> float:
-    """Of held-out episodes, crad; `choose(obs, r)` gives the actions.
+    """MAE over held-out episodes, crad; `choose(obs, r)` gives the actions.
 
-    The last step is left out: it shows the next episode.
+    The last step is left out, as its observation is from the next episode.
     """
     loops = gymnasium.make_vec(ID, num_envs=EPISODES)
     obs, infos = loops.reset(seed=HELD_OUT)
@@ -49,7 +49,7 @@ def mae(choose: Choose) -> float:
 
 
 def inner_loop_alone(obs: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """r~ = r, as an action: the bounds of r~ are at -1 and 1."""
+    """r~ = r as an action, which is -1 and 1 at the bounds of r~."""
     low, high = plants.make("pitch")[0].r_tilde_bounds
     return ((2.0 * r - low - high) / (high - low))[:, None]
 
@@ -75,16 +75,16 @@ def main() -> None:
     """Parse, train, compare, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=6000, help="environment steps, and updates (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of networks, noise and episodes (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="for networks, noise and episodes (default: %(default)s)")
     options = parser.parse_args()
     if options.steps < 1:
         parser.error(f"--steps is {options.steps}; it must be at least 1")
-    torch.set_num_threads(1)  # several wait for each other busily, which is slow where other programs want the cores
+    torch.set_num_threads(1)  # several threads busy-wait for each other, which is slow on shared cores
     envs = make_vec_env(
         ID,
         ENVIRONMENTS,
         seed=options.seed,
-        env_kwargs={"render_mode": None},  # else it asks for pictures first
+        env_kwargs={"render_mode": None},  # else it first tries to render
         wrapper_class=gymnasium.wrappers.TransformReward,
         wrapper_kwargs={"func": lambda reward: REWARD_SCALE * reward},
     )
@@ -97,7 +97,7 @@ def main() -> None:
         batch_size=256,
         gamma=0.97,
         train_freq=1,
-        gradient_steps=-1,  # as many as steps were made
+        gradient_steps=-1,  # as many as environment steps
         action_noise=NormalActionNoise(np.zeros(1), 0.1 * np.ones(1)),
         policy_kwargs={"net_arch": [128, 128]},
         seed=options.seed,

@@ -1,6 +1,6 @@
-"""Two cascaded tanks under a badly tuned PI level controller, whose valve has a dead band: a plant of your own.
+"""An example of your own plant: two cascaded tanks with a badly tuned PI level controller and a dead band in the valve.
 
-Check it, train on it, and compare the result with baselines, by this file and the name of the function at its end:
+Name it by this file and the function at its end. Check it, train on it, and compare the result with baselines:
 
     python -m jaxouter.check scripts/examples/tanks.py:Tanks
     python -m jaxouter.train scripts/examples/tanks.py:Tanks
@@ -16,19 +16,19 @@ from flax import struct
 from jaxouter.plants import Plant
 
 SUBSTEP = 1.0  # s
-SUBSTEPS = 10  # a control step
+SUBSTEPS = 10  # per control step
 
 
 @struct.dataclass
 class Params:
-    """What may be swept, or drawn anew for each episode by --randomise."""
+    """Parameters that can be swept, or drawn for each episode with --randomise."""
 
     area: jax.Array  # of each tank, cm2
     outlet: jax.Array  # outflow is outlet * sqrt(level), cm2.5/s
-    kp: jax.Array  # of the PI controller that nobody may touch, cm2/s
+    kp: jax.Array  # of the PI controller, which you cannot modify, cm2/s
     ki: jax.Array  # cm2/s2
     dead_band: jax.Array  # of the valve, cm3/s
-    load: jax.Array  # flow that someone draws from the upper tank, cm3/s
+    load: jax.Array  # flow drawn from the upper tank, cm3/s
 
 
 class State(NamedTuple):
@@ -41,7 +41,7 @@ class State(NamedTuple):
 
 
 def at_rest(params, level):
-    """The state in which both tanks stay at this level."""
+    """The steady state with both tanks at this level."""
     flow = params.outlet * jnp.sqrt(level) + params.load
     return State(level, level, flow / params.ki, flow)
 
@@ -52,12 +52,12 @@ def init(key, params):
 
 
 def start(key, params):
-    """Where episodes of the training start: rest at any level."""
+    """Start of a training episode: at rest at a random level."""
     return at_rest(params, jax.random.uniform(key, (), float, 8.0, 20.0))
 
 
 def step(params, state, r_tilde, key):
-    """Ten seconds with the set-point r~ held."""
+    """One control step, ten seconds, with the set-point r~ held."""
 
     def substep(state, _):
         error = r_tilde - state.lower

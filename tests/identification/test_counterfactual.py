@@ -69,7 +69,7 @@ def test_a_known_plant_that_responds_alike_at_all_times_is_simulated_beforehand(
 
 
 def test_a_plant_whose_response_changes_is_not():
-    with pytest.raises(ValueError, match="plant 'heaters' responds otherwise half an episode later"):
+    with pytest.raises(ValueError, match="plant 'heaters' responds differently half an episode later"):
         counterfactual.simulated(*make("heaters"), KEY, 2)
 
 

@@ -238,7 +238,7 @@ def test_what_it_declares_can_be_overridden(path: Path) -> None:
     assert plant.evaluation_range == (-1.0, 0.5)
     narrower, _ = recorded_data.make("log", str(path), PlantOptions(r_tilde_bounds=(-1.0, 1.0)))
     np.testing.assert_allclose(narrower.setpoint_range, (-0.5, 0.5), atol=0.02)
-    with pytest.raises(ValueError, match="recorded data tell their control step"):
+    with pytest.raises(ValueError, match="recorded data define the control step"):
         recorded_data.make("log", str(path), PlantOptions(control_step=1.0))
 
 

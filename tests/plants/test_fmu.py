@@ -96,7 +96,7 @@ def test_an_exported_controller_is_a_plant(controller, tmp_path, monkeypatch, ca
 def test_what_an_fmu_leaves_open_must_be_said(controller):
     with pytest.raises(ValueError, match=r"--input is None; .*outer.fmu has: r, y"):
         registry.add(f"fmu:{controller}")
-    with pytest.raises(ValueError, match=r"r~ lies between nan and nan: give it finite bounds"):
+    with pytest.raises(ValueError, match=r"the bounds of r~ are nan and nan; give finite ones"):
         registry.add(f"fmu:{controller}", PlantOptions(input="r"))
 
 

@@ -235,7 +235,7 @@ def test_a_trained_policy_acts_as_it_is():
 @pytest.mark.parametrize(
     ("plant", "text"),
     [
-        (lambda r_tilde: "high", "it gave 'high'; it must give a number, or None"),
+        (lambda r_tilde: "high", "it returned 'high'; it must return a number, or None"),
         (lambda r_tilde: 1 / 0, "it failed: ZeroDivisionError"),
     ],
 )

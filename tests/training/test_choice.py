@@ -94,7 +94,8 @@ def test_built_in_plants_stay_as_they_are() -> None:
 def test_what_nothing_moves_is_refused_before_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plants.REGISTRY, "kind", kinds.late(kinds.EPISODE))  # it answers after the episode's end
     with pytest.raises(
-        ValueError, match="for 100 control steps, its dead time, and an episode has 100: make it several times as long"
+        ValueError,
+        match=r"for 100 control steps \(the dead time\), and an episode has 100; make episodes several times",
     ):
         choose(CONFIG)
 
