@@ -7,7 +7,7 @@ import pytest
 
 from jaxouter import check, plants
 from jaxouter.plants import registry
-from tests import lag, logs
+from tests import lag, recorded
 from tests.load import ROOT
 from tests.precision import makes_nan
 
@@ -49,7 +49,7 @@ def test_what_is_not_pure_is_found_and_ends_with_status_1(tmp_path, capsys):
 
 
 def test_a_log_is_told_how_far_it_can_be_trusted(tmp_path, capsys):
-    path = logs.write(tmp_path / "tank-3.csv", logs.recorded(*lag.make(), rows=800, noise=0.03))
+    path = recorded.write(tmp_path / "tank-3.csv", recorded.recorded(*lag.make(), rows=800, noise=0.03))
     figure = tmp_path / "log.png"
     check.main([f"log:{path}", "--figure", str(figure)])
     out = capsys.readouterr().out

@@ -396,4 +396,4 @@ def test_ctrl_c_after_the_learning_says_how_to_go_on(monkeypatch, tmp_path, caps
     with pytest.raises(SystemExit) as end:
         train.main(["lag", "--out", str(tmp_path / "run")])
     assert end.value.code == 130
-    assert capsys.readouterr().err == f"saved; go on with: python -m jaxouter.train --resume {tmp_path}/run\n"
+    assert capsys.readouterr().err == f"saved; resume with: python -m jaxouter.train --resume {tmp_path}/run\n"
