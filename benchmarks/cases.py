@@ -267,7 +267,7 @@ def filled(trainer: Trainer, params: EnvParams) -> TrainState:
     rows, first = state.data.rows, off_policy(trainer).replay.mirror
     written = FILLED // off_policy(trainer).replay.environments
     rows = rows[:, first + jnp.arange(rows.shape[1]) % written]
-    return state._replace(replay=state.data._replace(rows=rows, written=jnp.asarray(off_policy(trainer).replay.steps)))
+    return state._replace(data=state.data._replace(rows=rows, written=jnp.asarray(off_policy(trainer).replay.steps)))
 
 
 def update_mflop(config: TrainConfig) -> int:
