@@ -1,6 +1,7 @@
 """A learner, a plant and a baseline of one's own, each in one file, through what the documentation promises alone."""
 
 import json
+import re
 from pathlib import Path
 from unittest.mock import patch
 
@@ -15,6 +16,7 @@ from jaxouter.agents.returns import generalised_advantage
 from jaxouter.exports.spec import ControllerSpec
 from jaxouter.plants import registry
 from jaxouter.training import epochs
+from jaxouter.training.config import configured
 from jaxouter.training.run import Run
 
 HERE = Path(__file__).parent / "additions"
@@ -99,6 +101,23 @@ def test_the_plant_has_presets_scenarios_and_a_sweep_of_its_own(tmp_path):
     assert (run.config.preset, run.config.agent.hidden, run.config.pretraining.gradient_steps) == ("quick", (8, 8), 20)
     summary = json.loads((run.path / "summary.json").read_text())
     assert set(summary["results"][0]["scenarios"]) == {"Room/day"}
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (
+            {"pretraining.gradient_step": 1},
+            "there is no option 'pretraining.gradient_step'; there are: pretraining.gra",
+        ),
+        ({"pretraining.gradient_steps": "many"}, "Expected `int`, got `str`"),
+        ({"agent.hidden": 8}, "Expected `array`, got `int`"),
+        ({"agent": "sac"}, "there is no agent 'sac'"),
+    ],
+)
+def test_a_preset_of_ones_own_that_is_wrong_is_named(options, text):
+    with pytest.raises(ValueError, match=f"{re.escape(text)}"):
+        configured("Room", "quick", {"agent": "ddpg", **options})
 
 
 @pytest.mark.parametrize(("terminated", "truncated"), [([], []), ([3], []), ([], [3]), ([1], [4]), ([5], [5])])

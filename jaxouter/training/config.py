@@ -198,8 +198,11 @@ def configured(plant: str, name: str, options: tasks.Options, agent: str | None 
     kind = agents.resolve(agent or own)
     settings = {key: value for key, value in options.items() if key.startswith("agent.")}
     rest = {key: value for key, value in options.items() if key not in settings}
-    base = TrainConfig(plant, name, _changed(kind(), settings if agent in (None, own) else {}, "agent."))
-    return _changed(base, rest, "")
+    try:
+        base = TrainConfig(plant, name, _changed(kind(), settings if agent in (None, own) else {}, "agent."))
+        return from_dict(to_dict(_changed(base, rest, "")))  # which looks at types too
+    except ValueError as error:
+        raise ValueError(f"preset {name!r} of {plant}: {error}") from None
 
 
 def with_options(config: TrainConfig, options: tasks.Options) -> TrainConfig:

@@ -34,7 +34,7 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.trainer import Trainer, build
 
-FORMAT = 1
+FORMAT = 2
 RUNS = Path("runs")  # default parent of run folders
 KEEP = 2  # checkpoints per seed
 SAVED = ("checkpoint-*.npz", "pretraining.npz")  # files that a seed can resume from

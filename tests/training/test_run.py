@@ -245,9 +245,9 @@ def test_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a run folder"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps({"format": 99}))
-    with pytest.raises(ValueError, match="not of format 1"):
+    with pytest.raises(ValueError, match="not of format 2"):
         Run.open(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"format": 1, "config": {"plant": "pitch"}}))
+    (tmp_path / "config.json").write_text(json.dumps({"format": 2, "config": {"plant": "pitch"}}))
     with pytest.raises(ValueError, match="is not a configuration"):
         Run.open(tmp_path)
 
