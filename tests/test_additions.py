@@ -25,6 +25,7 @@ LEARNER, PLANT, BASELINE = (
 )
 SHAPE = ["--environments", "16", "--epoch", "6400", "--history", "2", "--reward-scale", "0.1"]
 LEARN = ["--preset", "paper", "--agent", LEARNER, *SHAPE]
+CASES = ["--scenario", "Room/day", "Room/frost"]
 STEP = "def step(r_tilde):\n    return 0.8 * r_tilde\n"
 
 
@@ -81,7 +82,9 @@ def test_evaluated_exported_compared_and_live(folder, tmp_path, monkeypatch):
     assert set(json.loads(Path("found.json").read_text())["scenarios"]) == {"Room/day", "Room/frost", "Room/steps"}
     export.main([str(folder / "seed-0"), *named, "--format", "npz", "--out", "controller.npz", "--force"])
     assert ControllerSpec.load(Path("controller.npz")).plant == "Room"
-    compare.main([PLANT, "--agent", LEARNER, "--run", str(folder), "--policy", BASELINE, "static", "--out", "compare"])
+    compare.main(
+        [PLANT, "--agent", LEARNER, "--run", str(folder), "--policy", BASELINE, "static", *CASES, "--out", "compare"]
+    )
     content = json.loads(Path("compare/comparison.json").read_text())
     policies = content["policies"]
     assert (policies[BASELINE]["kind"], policies[BASELINE]["note"]) == ("baseline", "r~ = r + gain (r - y).")
