@@ -61,7 +61,7 @@ class Options:
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the results, which must not exist; default: runs/compare-PLANT."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
     list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print plants, presets, scenarios, sweeps and policies, and end."""
 

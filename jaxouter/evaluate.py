@@ -59,7 +59,7 @@ class Options:
     traces: Path | None = None
     """Write r, y and r~ of each scenario, (episodes, T) each, to this npz file."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show the trace of an error too."""
+    """Also show the traceback of an error."""
     list: bool = False
     """Print plants, presets, scenarios and policies, and end."""
 

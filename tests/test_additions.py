@@ -18,6 +18,7 @@ from jaxouter.plants import registry
 from jaxouter.training import epochs
 from jaxouter.training.config import configured
 from jaxouter.training.run import Run
+from tests.load import ROOT
 
 HERE = Path(__file__).parent / "additions"
 LEARNER, PLANT, BASELINE = (
@@ -164,6 +165,7 @@ def test_the_gradient_is_that_of_the_expected_reward():
     [
         (["--agent", "sac"], "there is no agent 'sac'; the agents are: ddpg"),
         (["--agent", f"{HERE}/room.py:ROOM"], "it must be a subclass of jaxouter.agents.AgentConfig"),
+        (["--agent", f"{ROOT}/jaxouter/agents/agent.py:AgentConfig"], "does not define build, data"),
         ([*LEARN, "--steps", "1008"], "steps is 1008; it must be a multiple of 320: agent.unroll = 20 steps of 16 env"),
     ],
 )

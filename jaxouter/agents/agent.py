@@ -7,6 +7,7 @@ loop need nothing else of a learner.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -107,7 +108,7 @@ def _multiple(name: str, value: int, of: int, what: str) -> None:
         raise ValueError(f"{name} is {value}; it must be a multiple of {what}")
 
 
-class AgentConfig:
+class AgentConfig(ABC):
     """Base class of a learner's settings: a frozen dataclass whose fields become the options `--agent.*`.
 
     It must have the field `hidden`, the widths of the actor's hidden layers.
@@ -116,13 +117,14 @@ class AgentConfig:
     hidden: tuple[int, ...]
 
     @property
+    @abstractmethod
     def data(self) -> OffPolicy | OnPolicy:
         """What it learns from."""
-        raise NotImplementedError
 
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027 - there may be nothing to check
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
 
+    @abstractmethod
     def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> Agent:
         """The learner.
 
@@ -131,7 +133,6 @@ class AgentConfig:
             total_updates: updates in the whole training, for schedules.
             axis: mapped axis over which gradients are averaged: each member updates on its part of the batch.
         """
-        raise NotImplementedError
 
 
 class Transitions(NamedTuple):

@@ -252,7 +252,7 @@ def live(path: Path, steps: Mapping[str, np.ndarray], unit: str = "1") -> Path:
         above, below = grid[:, column]
         above.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r")
         if np.isfinite(passed).any():
-            above.plot(t, passed, color=INNER, lw=1.2, label="y, had r passed")
+            above.plot(t, passed, color=INNER, lw=1.2, label="y if r passed through")
         above.plot(t, y, color=LEARNED, lw=1.6, label="output y")
         error = float(np.nanmean(np.abs(r[:-1] - y[1:]))) if len(t) > 1 else math.nan
         above.set_title(f"{title}: MAE {error:.3g}{told}", fontsize=10, loc="left")

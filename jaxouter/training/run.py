@@ -372,6 +372,8 @@ def add_agent(reference: str | None) -> str | None:
     file, colon, name = reference.rpartition(":")
     if colon and file.endswith(".py") and reference not in AGENTS:
         kind = attribute(Path(file), name, "an agent of your own")
+        if isinstance(kind, type) and (missing := getattr(kind, "__abstractmethods__", ())):
+            raise ValueError(f"{reference} does not define {', '.join(sorted(missing))}")
         if not (isinstance(kind, type) and issubclass(kind, AgentConfig)):
             raise ValueError(f"{reference} is {kind!r}; it must be a subclass of jaxouter.agents.AgentConfig")
         AGENTS[reference] = kind
