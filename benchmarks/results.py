@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from jaxouter.evaluation import scenarios
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -28,7 +28,7 @@ def maes(results: list[dict[str, Any]], policy: str, scenario: str) -> list[floa
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     rows: dict[str, dict[str, str]] = {}
     for path in runs:
-        run = Run.open(path)
+        run = RunFolder.open(path)
         name = f"{run.config.plant}-{run.config.preset}"
         content = (run.path / "summary.json").read_text()
         (RESULTS / f"{name}.json").write_text(content)

@@ -26,13 +26,13 @@ from jaxouter.evaluation.metrics import held, mae
 from jaxouter.evaluation.policies import NamedPolicy, baseline
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
-from jaxouter.training.run import Run, surroundings, write_json
+from jaxouter.training.run import RunFolder, surroundings, write_json
 
 RESULTS = Path(__file__).parent / "results"
 LEARNED, LIMIT = "learned", "its limit"
 
 
-def entrants(runs: Sequence[Run]) -> Iterator[tuple[str, list[NamedPolicy]]]:
+def entrants(runs: Sequence[RunFolder]) -> Iterator[tuple[str, list[NamedPolicy]]]:
     """Name and policies: one for each seed of the runs, and one of all others."""
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
@@ -72,7 +72,7 @@ def cell(row: Held, limit: Held) -> str:
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     """The command; several runs differ by their seeds."""
     cli.use_compilation_cache()
-    opened = [Run.open(path) for path in runs]
+    opened = [RunFolder.open(path) for path in runs]
     config, plant = opened[0].config, opened[0].config.plant
     plants = [scenarios.perturbed(name) for name in scenarios.for_stability(plant)]
     catalogue = [scenarios.get(name) for name in scenarios.catalogue(plant)]

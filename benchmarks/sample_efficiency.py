@@ -27,7 +27,7 @@ from jaxouter import cli
 from jaxouter.evaluation import figures, scenarios
 from jaxouter.evaluation.policies import baseline, evaluate
 from jaxouter.evaluation.statistics import interval
-from jaxouter.training.run import Run, surroundings, write_json
+from jaxouter.training.run import RunFolder, surroundings, write_json
 
 RESULTS = Path(__file__).parent / "results"
 SEEDS = 10
@@ -62,14 +62,14 @@ class Curve(NamedTuple):
         return int(self.steps[since]) if since < len(self.steps) else None
 
 
-def trained(folder: Path, *arguments: str) -> Run:
+def trained(folder: Path, *arguments: str) -> RunFolder:
     """The run in a folder, trained unless it is there."""
     if not (folder / "summary.json").exists():
         start = [*arguments, "--seeds", str(SEEDS), "--out", str(folder)]
         command = ["-m", "jaxouter.train", *(["--resume", str(folder)] if folder.exists() else start)]
         print(f"python {' '.join(command)}", flush=True)
         subprocess.run([sys.executable, *command], check=True)
-    return Run.open(folder)
+    return RunFolder.open(folder)
 
 
 def curves(plant: str, runs: Path) -> dict[str, Curve]:

@@ -40,7 +40,7 @@ from jaxouter.training.environments import TrainState
 from jaxouter.training.epochs import NotFiniteError, Pace, Row, train
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.resources import arithmetic, arithmetic_lines, resources
-from jaxouter.training.run import FORMAT, Run, add_agent, lock, write_json
+from jaxouter.training.run import FORMAT, RunFolder, add_agent, lock, write_json
 from jaxouter.training.trainer import Trainer
 
 LOOK_SECONDS = 5.0  # least time between two evaluations of the MAE during pretraining
@@ -113,7 +113,7 @@ def parse(arguments: list[str]) -> Options:
                 "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug; the run folder holds "
                 "the rest"
             )
-        run = Run.open(options.resume).config
+        run = RunFolder.open(options.resume).config
         if plant not in (run.plant, first.config.plant):
             raise ValueError(f"{options.resume} is a run on {run.plant}, not on {plant}")
         given = any(argument.split("=")[0] == "--devices" for argument in arguments)
@@ -148,8 +148,8 @@ def main(arguments: list[str] | None = None) -> None:
             config = config if options.resume is not None else chosen(config)
             resources(config).check()
             Fleet.of(config)  # the last checks before anything is written
-            path = devices.text_from_first(lambda: str(options.resume or Run.create(config, options.out).path))
-            run = Run(Path(path), config)
+            path = devices.text_from_first(lambda: str(options.resume or RunFolder.create(config, options.out).path))
+            run = RunFolder(Path(path), config)
             devices.text_from_first(lambda: stack.enter_context(lock(run.path)) or "")
             try:
                 new = options.resume is None and devices.is_first()
@@ -186,12 +186,12 @@ def chosen(config: TrainConfig) -> TrainConfig:
     return from_dict(json.loads(devices.text_from_first(choice)))
 
 
-def go_on(run: Run) -> str:
+def go_on(run: RunFolder) -> str:
     """How to resume the run."""
     return f"resume with: python -m jaxouter.train --resume {run.path}"
 
 
-def learn(run: Run, options: Options, progress: Progress) -> dict[int, TrainState] | None:
+def learn(run: RunFolder, options: Options, progress: Progress) -> dict[int, TrainState] | None:
     """Train with progress, to the end or until a signal."""
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
@@ -301,7 +301,9 @@ class Learning:
         return f"MAE {found}{unit} on {self._watched}"
 
 
-def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Progress, episodes: int | None) -> None:
+def report(
+    run: RunFolder, finals: dict[int, TrainState], begun: float, progress: Progress, episodes: int | None
+) -> None:
     """Evaluate on the paper's scenarios, write summary and figures, print the table."""
     plant, (trainer, params) = run.config.plant, run.trainer
     seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / run.config.side_by_side
@@ -354,7 +356,7 @@ def report(run: Run, finals: dict[int, TrainState], begun: float, progress: Prog
 
 
 def draw(
-    run: Run,
+    run: RunFolder,
     selected: list[scenarios.Scenario],
     simple: dict[str, Results],
     learned: Results,

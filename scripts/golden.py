@@ -29,7 +29,7 @@ import numpy as np
 import tyro
 
 from jaxouter.training.config import preset
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from jaxouter.training.trainer import build
 
 FILE = Path(__file__).resolve().parent.parent / "tests" / "golden.json"
@@ -108,7 +108,7 @@ def results(folder: Path, only: tuple[str, ...]) -> dict[str, Any]:
 
 def trained(path: Path) -> dict[str, Any]:
     """Initial weights, final state and metrics of a run."""
-    run = Run.open(path)
+    run = RunFolder.open(path)
     state, _ = run.load(0)
     trainer, params = build(preset(run.config.plant, run.config.preset))
     fresh = trainer.fresh(jax.random.key(0), params).agent

@@ -26,7 +26,7 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.training import checkpoint
-from jaxouter.training.run import Run, surroundings, write_json
+from jaxouter.training.run import RunFolder, surroundings, write_json
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "soak.json"
 TRAINING = (  # so small that some gradient steps and epochs take no longer than the start of the process
@@ -96,7 +96,7 @@ def killed(folder: Path, options: Options) -> list[dict[str, Any]]:
     return moments
 
 
-def differences(one: Run, other: Run) -> list[str]:
+def differences(one: RunFolder, other: RunFolder) -> list[str]:
     """Differences between two runs: checkpoints, rows of the metrics, files."""
     found = []
     for seed in one.seeds:
@@ -122,7 +122,7 @@ def soak(options: Options) -> dict[str, Any]:
         whole, disturbed = Path(folder) / "whole", Path(folder) / "disturbed"
         subprocess.run(command(whole, options), check=True, stdout=subprocess.DEVNULL)
         moments = killed(disturbed, options)
-        one, other = Run.open(whole), Run.open(disturbed)
+        one, other = RunFolder.open(whole), RunFolder.open(disturbed)
         if found := differences(one, other):
             raise RuntimeError(f"the runs differ in {', '.join(found)}")
         rows = sum(len(one.rows(seed)) for seed in one.seeds)

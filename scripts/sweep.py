@@ -24,7 +24,7 @@ import tyro
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.policies import NamedPolicy, evaluate
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
 DDPG_ALONE = ("--pretraining.gradient-steps", "0", "--steps")
@@ -56,7 +56,7 @@ def selected_on(plant: str) -> list[str]:
     return [name for name in scenarios.catalogue(plant) if scenarios.get(name, 1).stable_alone]
 
 
-def line(name: str, run: Run) -> list[str]:
+def line(name: str, run: RunFolder) -> list[str]:
     """Variant, seeds, median MAE of each scenario, and seconds per seed for the whole command."""
     trainer, _ = run.trainer
     selected = [scenarios.get(identifier) for identifier in selected_on(run.config.plant)]
@@ -94,7 +94,7 @@ def main(options: Options) -> None:
             train(plant, name, options)
         header = ["change", "seeds", *(identifier.split("/")[1] for identifier in selected_on(plant)), "s"]
         rows = [
-            line(name, Run.open(options.runs / f"{plant}-{name}"))
+            line(name, RunFolder.open(options.runs / f"{plant}-{name}"))
             for name in VARIANTS
             if (options.runs / f"{plant}-{name}").exists()
         ]

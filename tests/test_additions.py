@@ -17,7 +17,7 @@ from jaxouter.exports.spec import ControllerSpec
 from jaxouter.plants import registry
 from jaxouter.training import epochs
 from jaxouter.training.config import configured
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.load import ROOT
 
 HERE = Path(__file__).parent / "additions"
@@ -46,14 +46,14 @@ def folder(tmp_path_factory):
     return path
 
 
-def opened(folder) -> Run:
+def opened(folder) -> RunFolder:
     registry.add(PLANT)
     agents.AGENTS[LEARNER] = registry.attribute(HERE / "reinforce.py", "Reinforce", "")
-    return Run.open(folder)
+    return RunFolder.open(folder)
 
 
 def test_the_learner_learns(folder):
-    rows = Run.rows(opened(folder), 0)
+    rows = RunFolder.rows(opened(folder), 0)
     assert [row["updates"] for row in rows] == [20 * (i + 1) for i in range(10)]
     assert rows[-1]["mae"] < 0.5  # at first 2.1, by the static prefilter 0.42
     assert rows[-1]["reward"] > rows[0]["reward"]
@@ -63,7 +63,7 @@ def test_the_learner_learns(folder):
 
 def test_a_training_goes_on_where_it_was_stopped(folder, tmp_path):
     config = train.parse([PLANT, *LEARN, "--steps", "64000"]).config
-    run = Run.create(config, tmp_path / "stopped")
+    run = RunFolder.create(config, tmp_path / "stopped")
     assert epochs.train(run, stop=lambda: True) is None
     finals = epochs.train(run)
     assert finals is not None

@@ -23,7 +23,7 @@ from jaxouter.loop import references
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict
 from jaxouter.training.resources import resources
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.training.small import small
 
 some = settings(
@@ -154,18 +154,18 @@ def test_any_command_line_of_evaluate_without_a_run_is_refused(arguments, tmp_pa
 def test_any_config_json_is_a_run_or_refused(content, tmp_path):
     (tmp_path / "config.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"config\.json"):
-        Run.open(tmp_path)
+        RunFolder.open(tmp_path)
 
 
 @some
 @given(path=st.sampled_from(["format", "config", "versions", "device", "flags"]), value=values)
 def test_a_run_folder_with_any_value_is_a_run_or_refused(path, value, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "run"
-    Run.create(small(), folder)
+    RunFolder.create(small(), folder)
     content = json.loads((folder / "config.json").read_text()) | {path: value}
     (folder / "config.json").write_text(json.dumps(content))
     with contextlib.suppress(ValueError):
-        run = Run.open(folder)
+        run = RunFolder.open(folder)
         assert run.config.check()
         assert isinstance(run.changes(), list)
 
@@ -224,7 +224,7 @@ class Planted:
 def test_a_run_folder_from_someone_else_executes_nothing(tmp_path, monkeypatch):
     """A pickled array among the others, a plant that names code, and a module beside the run."""
     monkeypatch.chdir(tmp_path)
-    run = Run.create(small(), tmp_path / "run")
+    run = RunFolder.create(small(), tmp_path / "run")
     path = run.seed_folder(0) / "checkpoint-000001.npz"
     header = np.asarray(json.dumps({"format": checkpoint.FORMAT}))
     np.savez(path, header=header, planted=np.array([Planted()], dtype=object))

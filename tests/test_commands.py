@@ -17,7 +17,7 @@ from tensorboardX.proto import event_pb2
 from jaxouter import evaluate, train
 from jaxouter.plants import REGISTRY
 from jaxouter.training.config import to_dict
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests import interrupts, lag
 from tests.precision import of_single_draws
 from tests.training.small import small
@@ -213,7 +213,7 @@ def test_bad_input_leaves_no_traceback(tmp_path):
 
 
 def test_run_without_or_with_a_damaged_checkpoint_is_refused(tmp_path, capsys):
-    run = Run.create(small(), tmp_path / "run")
+    run = RunFolder.create(small(), tmp_path / "run")
     path = run.seed_folder(0) / "checkpoint-000001.npz"
     for content, text in ((None, "has no checkpoint yet"), (b"junk", "is not a readable checkpoint")):
         if content is not None:
@@ -248,7 +248,7 @@ def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
     _, errors = process.communicate(timeout=100)
     assert process.returncode == 130, errors
     assert "python -m jaxouter.train --resume run" in errors
-    run = Run.open(tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
     done = len(run.rows(0))
     assert 0 < done < run.config.epochs
     assert run.load(0)[1] == done
@@ -259,7 +259,7 @@ def test_metrics_are_tensorboard_events_too(trained):
     """Also those of rows that were there before; of each value the row's, once."""
     _, folder = trained
     shutil.copytree(folder, folder.parent / "events")
-    run = Run.open(folder.parent / "events")
+    run = RunFolder.open(folder.parent / "events")
     for seed in run.seeds:
         run.forget(seed, 0)  # both epochs run again
     train.main(["--resume", str(run.path), "--tensorboard"])
@@ -300,7 +300,7 @@ def test_third_plant_goes_through_the_whole_of_training(tmp_path, monkeypatch, c
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     out = tmp_path / "run"
     train.main(["lag", "--pretraining.gradient-steps", "200", "--out", str(out)])
-    assert to_dict(Run.open(out).config)["plant"] == "lag"
+    assert to_dict(RunFolder.open(out).config)["plant"] == "lag"
     results = json.loads((out / "summary.json").read_text())["results"]
     maes = {result["policy"]: result["scenarios"]["lag/steps"]["mae"] for result in results}
     assert maes["learned"] < maes["static"] < maes["none"]

@@ -22,7 +22,7 @@ from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
 from jaxouter.evaluation.comparison import Comparison
 from jaxouter.plants import REGISTRY
-from jaxouter.training.run import Run, write_json
+from jaxouter.training.run import RunFolder, write_json
 from tests import interrupts, lag
 from tests.training.small import small
 
@@ -63,7 +63,7 @@ def own_cache(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of two seeds that has only begun, of which the second counts as the median."""
-    run = Run.create(small("pitch", seeds=2), tmp_path_factory.mktemp("runs") / "run")
+    run = RunFolder.create(small("pitch", seeds=2), tmp_path_factory.mktemp("runs") / "run")
     trainer, params = run.trainer
     for seed in run.seeds:
         run.save(seed, 1, trainer.start(seed, params))
@@ -218,7 +218,7 @@ def place(tmp_path, monkeypatch):
     folder = tmp_path / "place"
     folder.mkdir()
     monkeypatch.chdir(folder)
-    Run.create(small("heaters"), Path("heated"))
+    RunFolder.create(small("heaters"), Path("heated"))
     Path("fails.py").write_text("1 / 0")
     Path("empty.py").touch()
     shutil.copy(LEAD, "lead.py")
@@ -304,7 +304,7 @@ def test_everything_is_the_default(place, monkeypatch):
     assert plan.scenarios == tuple(scenarios.catalogue("pitch"))
     assert plan.sweeps == tuple(sweeps.catalogue("pitch"))
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
-    run = Run.create(small("lag"), Path("lagging"))
+    run = RunFolder.create(small("lag"), Path("lagging"))
     trainer, params = run.trainer
     run.save(0, 1, trainer.start(0, params))
     plan = compare.check(compare.Options(run=(run.path,), policy=("lead.py:Lead",)))

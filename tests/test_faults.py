@@ -10,16 +10,16 @@ import pytest
 
 from jaxouter.training import checkpoint
 from jaxouter.training.epochs import train
-from jaxouter.training.run import Run, lock
+from jaxouter.training.run import RunFolder, lock
 from tests.load import load
 from tests.training.small import small
 
 TMPFS = ["unshare", "--user", "--map-root-user", "--mount"]
 
 
-def begun(path: Path) -> Run:
+def begun(path: Path) -> RunFolder:
     """A run after its first epoch."""
-    run = Run.create(small(), path)
+    run = RunFolder.create(small(), path)
     assert train(run, stop=lambda: True) is None
     return run
 

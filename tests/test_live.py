@@ -14,7 +14,7 @@ import pytest
 from jaxouter import live
 from jaxouter.exports.spec import ControllerSpec
 from jaxouter.identification.recorded_data import read
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests import interrupts
 from tests.load import ROOT
 from tests.training.small import small
@@ -91,7 +91,7 @@ def test_it_goes_on_where_it_was_and_ends_by_ctrl_c(begun, tmp_path):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run folder with a checkpoint."""
-    run = Run.create(small("pitch"), tmp_path_factory.mktemp("run") / "pitch")
+    run = RunFolder.create(small("pitch"), tmp_path_factory.mktemp("run") / "pitch")
     trainer, params = run.trainer
     run.save(0, 0, trainer.fresh(jax.random.key(0), params))
     return run.path

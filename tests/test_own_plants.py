@@ -9,7 +9,7 @@ import pytest
 
 from jaxouter import evaluate, plants, train
 from jaxouter.plants import registry
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests import lag
 from tests.load import ROOT
 from tests.recorded import recorded, write
@@ -34,7 +34,7 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
     evaluate.main(["run", "--plant", TANKS, "--scenario", "Tanks/steps", "--episodes", "2"])
     del plants.REGISTRY["Tanks"], registry.REGISTRATIONS["Tanks"]
     with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
-        Run.open(tmp_path / "run")
+        RunFolder.open(tmp_path / "run")
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from jaxouter.evaluation import policies, scenarios
 from jaxouter.evaluation.metrics import held
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.plants import registry
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.load import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
@@ -54,5 +54,5 @@ def robust(tmp_path_factory):
     """Policy and its parameters."""
     folder = tmp_path_factory.mktemp("robust") / "run"
     train.main(["pitch", "--preset", "robust", "--out", str(folder)])
-    run = Run.open(folder)
+    run = RunFolder.open(folder)
     return run.trainer[0].policy, run.trainer[0].policy_params(run.load(0)[0])

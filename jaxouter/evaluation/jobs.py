@@ -39,7 +39,7 @@ from jaxouter.loop.policy import Policy
 from jaxouter.plants import Plant, make
 from jaxouter.plants.errors import PlantError
 from jaxouter.plants.registry import attribute, own_errors
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 
 TUNED = ("baseline", "limit")  # kinds of policies that are identified first
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
@@ -146,7 +146,7 @@ def load(entrant: Entrant, plant_name: str) -> tuple[Policy, Any]:
     """
     plant, _ = make(plant_name)
     if entrant.kind == "learned":
-        return Run.open(Path(entrant.path or "")).policy(entrant.seed or 0)
+        return RunFolder.open(Path(entrant.path or "")).policy(entrant.seed or 0)
     if entrant.kind == "user":
         with blamed(entrant.name, "can't be made"):
             policy = attribute(Path(entrant.path or ""), entrant.attribute, OWN)(plant)
@@ -335,7 +335,7 @@ def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, Pol
     """What each policy is, and what its identification and tuning took."""
     tuned = {d.job.entrant.name: d.found for d in done if d.job.what == "identify"}
     paths = dict.fromkeys(Path(c.path or "") for c in entrants if c.kind == "learned")
-    configs = {path.name: Run.open(path).config for path in paths}
+    configs = {path.name: RunFolder.open(path).config for path in paths}
 
     def about(c: Entrant) -> PolicyInfo:
         if c.kind == "learned":

@@ -14,7 +14,7 @@ import numpy as np
 from jaxouter.training import devices
 from jaxouter.training.environments import TrainState
 from jaxouter.training.pretraining import PretrainingState, Say
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from jaxouter.training.trainer import Trainer
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ class Pace:
 
 
 def train(
-    run: Run,
+    run: RunFolder,
     on_epoch: OnEpoch = lambda trainer, state: {},
     report: Report = lambda seed, row: None,
     stop: Callable[[], bool] = lambda: False,
@@ -169,7 +169,7 @@ def _check(seed: int, epoch: int, state: TrainState) -> None:
 
 
 def _begin(
-    run: Run,
+    run: RunFolder,
     seeds: range,
     done: int,
     report: Callable[[int, PretrainingState, Callable[[], TrainState]], None],

@@ -45,14 +45,14 @@ class RunWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class Run:
+class RunFolder:
     """A run folder and its configuration."""
 
     path: Path
     config: TrainConfig
 
     @classmethod
-    def create(cls, config: TrainConfig, out: Path | None) -> Run:
+    def create(cls, config: TrainConfig, out: Path | None) -> RunFolder:
         """Make a new folder; `out` None: runs/PLANT-PRESET-SEED, with -2, -3, ... if that exists.
 
         Raises:
@@ -85,7 +85,7 @@ class Run:
         raise ValueError(f"{candidates[0]} exists; choose another --out, or resume it with --resume {candidates[0]}")
 
     @classmethod
-    def open(cls, path: Path) -> Run:
+    def open(cls, path: Path) -> RunFolder:
         """Open a folder that `create` made.
 
         Raises:
@@ -386,7 +386,7 @@ def own_agents() -> tuple[str, ...]:
     return tuple(name for name in AGENTS if ".py:" in name)
 
 
-def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
+def open_run(path: Path) -> tuple[RunFolder, int, tuple[int, ...]]:
     """The run in a folder, its median seed and all its seeds; for the folder of one seed, only that seed.
 
     Raises:
@@ -394,12 +394,12 @@ def open_run(path: Path) -> tuple[Run, int, tuple[int, ...]]:
     """
     name = path.resolve().name
     if name.startswith("seed-") and not (path / "config.json").exists():
-        run = Run.open(path.resolve().parent)
+        run = RunFolder.open(path.resolve().parent)
         seed = next((seed for seed in run.seeds if run.seed_folder(seed).name == name), None)
         if seed is None:
             raise ValueError(f"{path} is not a seed of its run, which has: {', '.join(map(str, run.seeds))}")
         return run, seed, (seed,)
-    run = Run.open(path)
+    run = RunFolder.open(path)
     return run, run.median_seed(), tuple(run.seeds)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 
 
 def require() -> None:
@@ -20,7 +20,7 @@ def require() -> None:
 class Events:
     """Writes the rows of a run to the folder of their seed. No background thread, whose errors would be lost."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunFolder) -> None:
         self._run, self._writers = run, {}
 
     def __call__(self, seed: int, row: Mapping[str, Any]) -> None:

@@ -24,7 +24,7 @@ from jaxouter.evaluation.stability import analyse
 from jaxouter.identification import steady_state
 from jaxouter.loop.policy import none
 from jaxouter.plants import REGISTRY
-from jaxouter.training.run import Run, write_json
+from jaxouter.training.run import RunFolder, write_json
 from tests import interrupts, lag
 from tests.precision import makes_nan
 from tests.training.small import small
@@ -136,7 +136,7 @@ def run(tmp_path_factory):
     """A run on the lag of two seeds, that has only begun; the second counts as the median."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(REGISTRY, "lag", lag.make)
-        run = Run.create(small("lag", seeds=2), tmp_path_factory.mktemp("runs") / "run")
+        run = RunFolder.create(small("lag", seeds=2), tmp_path_factory.mktemp("runs") / "run")
         trainer, params = run.trainer
         for seed in run.seeds:
             run.save(seed, 1, trainer.start(seed, params))

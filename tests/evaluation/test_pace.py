@@ -16,7 +16,7 @@ from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import records, steady_state
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.training.small import TINY, small
 
 NAMES = ["mine/steps", "mine/staircase", "mine/ramps"]
@@ -123,13 +123,13 @@ def test_a_run_that_learned_nothing_leaves_no_folder(capsys, tmp_path, monkeypat
 @pytest.mark.usefixtures("slow")
 def test_after_the_training_of_a_slow_plant_there_are_few_episodes(capsys, tmp_path, monkeypatch):
     """As many as are asked for, or as take no longer than learning did."""
-    run = Run.create(small("mine"), tmp_path / "run")
+    run = RunFolder.create(small("mine"), tmp_path / "run")
     trainer, params = run.trainer
     finals = {0: trainer.fresh(jax.random.key(0), params)}
     monkeypatch.setattr(train, "draw", lambda *_: "figure")
     for seconds, asked, episodes in ((4.5, None, 4), (4.5, 2, 2)):
         rows = [{"seconds": 3 * 3 * 20 * 7e-3 * seconds}]  # of three policies on three scenarios
-        monkeypatch.setattr(Run, "rows", lambda run, seed, rows=rows: rows)
+        monkeypatch.setattr(RunFolder, "rows", lambda run, seed, rows=rows: rows)
         train.report(run, finals, 0.0, cli.progress(), asked)
         text = "evaluation: 3 scenarios of 4 episodes: about 5 s, at 7 ms a control step, as long as learning took"
         assert (text in capsys.readouterr().out) == (episodes == 4)

@@ -15,7 +15,7 @@ from jaxouter import export, plants
 from jaxouter.evaluation.verdict import Verdict, judge
 from jaxouter.loop.policy import AffineParams
 from jaxouter.training.policy import LearnedParams
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from jaxouter.training.trainer import build
 from tests import kinds
 from tests.training.small import small
@@ -66,11 +66,11 @@ def test_what_diverges_is_worse() -> None:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
-    return Run.create(small("kind"), tmp_path / "run")
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(small("kind"), tmp_path / "run")
 
 
-def test_export_refuses_what_is_worse_unless_forced(run: Run) -> None:
+def test_export_refuses_what_is_worse_unless_forced(run: RunFolder) -> None:
     summary = run.path / "summary.json"
     options = export.Options(run.path, format="npz")
     for older in ({}, {"verdict": {"worse": [], "text": ""}}):

@@ -28,7 +28,7 @@ from jaxouter import export, plants
 from jaxouter.exports import c, fmu, verify
 from jaxouter.exports.spec import ControllerSpec
 from jaxouter.plants import registry
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.load import ROOT
 from tests.training.small import small
 
@@ -40,7 +40,7 @@ MORE = ["-Wshadow", "-Wconversion", "-Wno-sign-conversion", "-Wdouble-promotion"
 class Trained(NamedTuple):
     """A run whose policy moves r~ over much of its range."""
 
-    run: Run
+    run: RunFolder
     policy: Any
     params: Any
     spec: ControllerSpec
@@ -51,7 +51,7 @@ class Trained(NamedTuple):
 
 
 def trained(plant: str, folder: Path) -> Trained:
-    run = Run.create(small(plant), folder / plant)
+    run = RunFolder.create(small(plant), folder / plant)
     trainer, params = run.trainer
     state = trainer.start(0, params)
     actor = jax.tree.map(lambda leaf: 3.0 * leaf, state.agent.actor)
@@ -212,7 +212,7 @@ def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
 def test_bad_input_is_one_message_and_status_2(pitch, arguments, text, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(pitch.run.path, "pitch")
-    Run.create(small("pitch"), Path("empty"))
+    RunFolder.create(small("pitch"), Path("empty"))
     Path("there.h").touch()
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as end:

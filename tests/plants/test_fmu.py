@@ -18,7 +18,7 @@ from jaxouter import check, export, plants, train
 from jaxouter.exports import c
 from jaxouter.plants import interface, registry, simulate
 from jaxouter.plants.simulators import PlantOptions
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests.training.small import TINY, small
 
 FEW = ["--episode-steps", "30"]
@@ -37,7 +37,7 @@ def controller(tmp_path_factory):
     if not any(map(shutil.which, c.COMPILERS)):
         pytest.skip("there is no C compiler")
     folder = tmp_path_factory.mktemp("exported")
-    run = Run.create(small("pitch", residual=True), folder / "run")
+    run = RunFolder.create(small("pitch", residual=True), folder / "run")
     trainer, params = run.trainer
     run.save(0, 1, trainer.start(0, params))
     export.main([str(run.path), "--format", "fmu", "--out", str(folder / "outer.fmu")])
@@ -76,7 +76,7 @@ def trained(arguments, name, capsys):
     out = capsys.readouterr().out
     assert f"{name}/steps" in out
     assert "diverged" not in out
-    return Run.open(Path("run")).config
+    return RunFolder.open(Path("run")).config
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from jaxouter.training.devices import Fleet, spread
 from jaxouter.training.epochs import train
 from jaxouter.training.off_policy import FIELDS
 from jaxouter.training.pretraining import DifferentiableRollout
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests import lag
 from tests.additions.reinforce import Reinforce
 from tests.training.small import small
@@ -24,16 +24,16 @@ SHORT = dict(steps=1_280, epoch=320, noise_sigma=(1e-4, 0.5))  # two epochs
 @pytest.fixture(scope="module")
 def spanning(tmp_path_factory):
     """A run of one learner on four devices, stopped after its first epoch."""
-    run = Run.create(small(devices=4, **SHORT), tmp_path_factory.mktemp("spanning") / "run")
+    run = RunFolder.create(small(devices=4, **SHORT), tmp_path_factory.mktemp("spanning") / "run")
     assert train(run, stop=lambda: True) is None
     return run
 
 
 def test_seeds_on_devices_of_their_own_equal_single_runs(tmp_path):
-    together = train(Run.create(small(seeds=4, devices=2, **SHORT), tmp_path / "together"))
+    together = train(RunFolder.create(small(seeds=4, devices=2, **SHORT), tmp_path / "together"))
     assert together is not None
     for seed in (1, 2):  # one on each device, of different rounds
-        alone = train(Run.create(small(seed=seed, **SHORT), tmp_path / f"alone-{seed}"))
+        alone = train(RunFolder.create(small(seed=seed, **SHORT), tmp_path / f"alone-{seed}"))
         assert alone is not None
         chex.assert_trees_all_close(together[seed].agent, alone[seed].agent, rtol=1e-5, atol=1e-6)
         chex.assert_trees_all_close(together[seed].data, alone[seed].data, rtol=1e-5, atol=1e-5)
@@ -44,7 +44,7 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
     config = small(seeds=seeds, devices=4, **SHORT)
     fleet = Fleet.of(config)
     assert dict(fleet.mesh.shape) == {"seeds": seeds, "environments": shards}
-    trainer, params = Run(None, config).trainer
+    trainer, params = RunFolder(None, config).trainer
     state = fleet.prefill(fleet.put([trainer.start(seed, params) for seed in range(seeds)]), params)
     before = fleet.take(state)
     state, metrics = fleet.epoch(state, params, 320)
@@ -69,7 +69,7 @@ def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, sh
     config = replace(small(seeds=seeds, devices=4, steps=1_280, epoch=640), agent=Reinforce(rate=1e-3, sigma=0.1))
     fleet = Fleet.of(config)
     assert fleet.trainer.environments.shards == shards
-    trainer, params = Run(None, config).trainer
+    trainer, params = RunFolder(None, config).trainer
     state = fleet.prefill(fleet.put([trainer.start(seed, params) for seed in range(seeds)]), params)
     before = fleet.take(state)
     state, metrics = fleet.epoch(state, params, 640)
@@ -114,7 +114,7 @@ def test_an_actor_pretrained_on_four_devices_is_that_of_one(tmp_path, monkeypatc
     actors = []
     for devices in (1, 4):
         config = small("lag", pretraining=start, residual=True, steps=0, devices=devices)
-        finals = train(Run.create(config, tmp_path / str(devices)))
+        finals = train(RunFolder.create(config, tmp_path / str(devices)))
         assert finals is not None
         actors.append(finals[0].agent.actor)
     assert [rollout.devices for rollout in made] == [1, 4]

@@ -18,7 +18,7 @@ from jaxouter.agents.agent import Transitions
 from jaxouter.agents.ddpg import DDPG, DDPGConfig
 from jaxouter.train import parse
 from jaxouter.training.devices import Processes
-from jaxouter.training.run import Run
+from jaxouter.training.run import RunFolder
 from tests import interrupts
 from tests.precision import of_single_draws
 from tests.training.small import small
@@ -78,7 +78,7 @@ def test_processes_that_do_not_fit_are_named(options, text):
 
 
 def test_resumption_takes_the_devices_of_the_run_unless_told(tmp_path):
-    path = str(Run.create(small(devices=4), tmp_path / "run").path)
+    path = str(RunFolder.create(small(devices=4), tmp_path / "run").path)
     assert parse(["--resume", path]).config == small(devices=4)
     assert parse(["--resume", path, "--devices", "1"]).config == small()
 
@@ -133,12 +133,12 @@ def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
             time.sleep(0.02)
         processes[1].send_signal(signal.SIGINT)
         assert ended(processes) == [130, 130]
-    assert 0 < len(Run.open(tmp_path / "apart").rows(0)) < 50
+    assert 0 < len(RunFolder.open(tmp_path / "apart").rows(0)) < 50
     again = ([*train, "together"], *(["--resume", "apart", *which] for which in pair()))
     with started(tmp_path, *again) as processes:
         assert ended(processes) == [0, 0, 0]
 
-    runs = [Run.open(tmp_path / name) for name in ("together", "apart")]
+    runs = [RunFolder.open(tmp_path / name) for name in ("together", "apart")]
     together, apart = (run.load(0)[0] for run in runs)
     assert int(apart.agent.updates) == 50
     assert [row["epoch"] for row in runs[1].rows(0)] == list(range(1, 51))

@@ -14,7 +14,7 @@ from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.epochs import train
 from jaxouter.training.pretraining import ADAM, DifferentiableRollout, Whitening
-from jaxouter.training.run import Run, RunWarning
+from jaxouter.training.run import RunFolder, RunWarning
 from jaxouter.training.trainer import build
 from tests import lag
 from tests.training.small import small, with_agent
@@ -139,18 +139,18 @@ def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
 
 
 def test_a_run_may_end_with_the_start(config, tmp_path):
-    run = Run.create(config, tmp_path / "run")
+    run = RunFolder.create(config, tmp_path / "run")
     finals = train(run, lambda trainer, state: {"mae": 1.0})
     assert finals is not None
     assert config.epochs == 0
     assert [row["epoch"] for row in run.rows(0)] == [0]
-    again = train(Run.open(run.path), pretrained=lambda *_: pytest.fail("pretrained again"))
+    again = train(RunFolder.open(run.path), pretrained=lambda *_: pytest.fail("pretrained again"))
     jax.tree.map(np.testing.assert_array_equal, finals[0].agent.actor, again[0].agent.actor)
 
 
 def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
     longer = replace(config, steps=2_560)
-    run = Run.create(longer, tmp_path / "run")
+    run = RunFolder.create(longer, tmp_path / "run")
     asked = iter([False, False, True])  # two chunks of the start, then the first epoch
     assert train(run, stop=lambda: next(asked)) is None
     assert train(run, pretrained=lambda *_: pytest.fail("pretrained again")) is not None
@@ -158,28 +158,28 @@ def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
 
 
 def test_a_start_that_was_stopped_goes_on_where_it_was(config, tmp_path):
-    whole, stopped = Run.create(config, tmp_path / "whole"), Run.create(config, tmp_path / "stopped")
+    whole, stopped = RunFolder.create(config, tmp_path / "whole"), RunFolder.create(config, tmp_path / "stopped")
     finals, heard = train(whole), []
     assert train(stopped, stop=lambda: True) is None
     assert (stopped.checkpoints(0), stopped.rows(0)) == ({}, [])
-    resumed = train(Run.open(stopped.path), pretrained=lambda seed, at, look: heard.append(int(at.done)))
+    resumed = train(RunFolder.open(stopped.path), pretrained=lambda seed, at, look: heard.append(int(at.done)))
     assert heard == [100]
     chex.assert_trees_all_equal(finals, resumed)
     assert stopped.load_pretraining(0) is None
 
 
 def test_a_damaged_first_checkpoint_is_made_again(config, tmp_path):
-    run = Run.create(config, tmp_path / "run")
+    run = RunFolder.create(config, tmp_path / "run")
     finals = train(run)
     (path,) = run.checkpoints(0).values()
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.warns(RunWarning, match=r"checkpoint-000000\.npz is not a readable checkpoint"):
-        resumed = train(Run.open(run.path))
+        resumed = train(RunFolder.open(run.path))
     chex.assert_trees_all_equal(finals, resumed)
 
 
 def test_a_damaged_start_begins_anew(config, tmp_path):
-    run, heard = Run.create(config, tmp_path / "run"), []
+    run, heard = RunFolder.create(config, tmp_path / "run"), []
     train(run, stop=lambda: True)
     path = run.seed_folder(0) / "pretraining.npz"
     path.write_bytes(path.read_bytes()[:-1])

@@ -13,16 +13,16 @@ import pytest
 
 from jaxouter.training import checkpoint, resources
 from jaxouter.training.epochs import NotFiniteError, Pace, train
-from jaxouter.training.run import KEEP, Run, RunWarning, lock
+from jaxouter.training.run import KEEP, RunFolder, RunWarning, lock
 from tests.precision import FLOAT, makes_nan
 from tests.training.small import small
 
 
-def new_run(path: Path, **changes) -> Run:
-    return Run.create(small(**changes), path)
+def new_run(path: Path, **changes) -> RunFolder:
+    return RunFolder.create(small(**changes), path)
 
 
-def rows_without_times(run: Run, seed: int):
+def rows_without_times(run: RunFolder, seed: int):
     return [
         {key: value for key, value in row.items() if "second" not in key}  # wall time and rates
         for row in run.rows(seed)
@@ -35,7 +35,7 @@ def test_stop_save_and_go_on_equals_an_uninterrupted_run(tmp_path):
     assert finals is not None
     asked = iter([False, True])
     assert train(halved, stop=lambda: next(asked)) is None
-    again = Run.open(halved.path)
+    again = RunFolder.open(halved.path)
     resumed = train(again)
     chex.assert_trees_all_equal(finals, resumed)
     assert whole.fleet.prefill._cache_size() == again.fleet.prefill._cache_size() == 1
@@ -68,7 +68,7 @@ def test_a_row_that_was_not_written_to_its_end_is_none(tmp_path):
         run.rows(0)
 
 
-def keep(run: Run, *epochs: int) -> None:
+def keep(run: RunFolder, *epochs: int) -> None:
     """Checkpoints of each seed after so many epochs; for seed 0 first."""
     for seed, of_seed in zip(run.seeds, epochs, strict=True):
         for epoch in of_seed:
@@ -105,7 +105,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(tmp_pat
     with pytest.warns(RunWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
         assert damaged.load(0)[1] == 1
     with pytest.warns(RunWarning, match=r"checkpoint-000002\.npz is not a readable checkpoint"):
-        resumed = train(Run.open(damaged.path))
+        resumed = train(RunFolder.open(damaged.path))
     chex.assert_trees_all_equal(finals, resumed)
     assert rows_without_times(whole, 0) == rows_without_times(damaged, 0)
 
@@ -153,7 +153,7 @@ def test_saving_takes_no_more_than_its_share(monkeypatch):
 def test_a_folder_is_trained_by_one_process_at_a_time(tmp_path):
     run = new_run(tmp_path / "run")
     refused = pytest.raises(ValueError, match=rf"is being trained by process {os.getpid()}")
-    with lock(run.path), refused, lock(Run.open(run.path).path):
+    with lock(run.path), refused, lock(RunFolder.open(run.path).path):
         pass
     with lock(run.path):
         pass
@@ -196,7 +196,7 @@ def test_a_summary_that_is_damaged_is_named(tmp_path, content):
         run.median_seed()
     (run.path / "config.json").write_text("[" * 100_000)
     with pytest.raises(ValueError, match="is not a run folder"):
-        Run.open(run.path)
+        RunFolder.open(run.path)
 
 
 def test_what_changed_since_the_run_was_made_is_listed(tmp_path):
@@ -232,7 +232,7 @@ def test_old_checkpoints_are_removed(tmp_path):
 
 def test_default_folder_gets_a_number_where_it_exists(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = [str(Run.create(small(), None).path) for _ in range(3)]
+    names = [str(RunFolder.create(small(), None).path) for _ in range(3)]
     assert names == ["runs/heaters-default-0", "runs/heaters-default-0-2", "runs/heaters-default-0-3"]
 
 
@@ -243,13 +243,13 @@ def test_given_folder_must_not_exist(tmp_path):
 
 def test_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a run folder"):
-        Run.open(tmp_path)
+        RunFolder.open(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps({"format": 99}))
     with pytest.raises(ValueError, match="not of format 2"):
-        Run.open(tmp_path)
+        RunFolder.open(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps({"format": 2, "config": {"plant": "pitch"}}))
     with pytest.raises(ValueError, match="is not a configuration"):
-        Run.open(tmp_path)
+        RunFolder.open(tmp_path)
 
 
 def test_config_json_says_what_the_result_depends_on(tmp_path):
