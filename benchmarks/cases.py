@@ -373,9 +373,9 @@ def first_epoch(config: TrainConfig) -> Callable[[], Any]:
 def compilation(name: str) -> Job:
     """`first_epoch` of a preset on pitch, from nothing."""
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        from jaxouter import cli  # what the command sets beside the folder; it takes a while to import
+        from jaxouter.evaluation import cache  # what the command sets beside the folder; it takes a while to import
 
-        cli.use_compilation_cache()
+        cache.use_compilation_cache()
     return Job(first_epoch(preset("pitch", name)), 1, "s")
 
 

@@ -17,7 +17,7 @@ import msgspec
 import tyro
 
 from jaxouter.evaluation import scenarios, statistics
-from jaxouter.evaluation.comparison import Comparison
+from jaxouter.evaluation.results import Comparison
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -20,7 +20,7 @@ from comparison import show
 from msgspec import Struct
 
 from jaxouter import cli
-from jaxouter.evaluation import scenarios
+from jaxouter.evaluation import cache, scenarios
 from jaxouter.evaluation.baselines import BASELINES, oracle
 from jaxouter.evaluation.metrics import held, mae
 from jaxouter.evaluation.policies import NamedPolicy, baseline
@@ -36,9 +36,12 @@ def entrants(runs: Sequence[RunFolder]) -> Iterator[tuple[str, list[NamedPolicy]
     """Name and policies: one for each seed of the runs, and one of all others."""
     run, (trainer, _) = runs[0], runs[0].trainer
     states = [one.load(seed)[0] for one in runs for seed in one.seeds]
-    yield LEARNED, [NamedPolicy(LEARNED, trainer.policy, trainer.policy_params(state)) for state in states]
+    yield (
+        LEARNED,
+        [NamedPolicy(LEARNED, trainer.policy, trainer.policy_params(state), run.config.plant) for state in states],
+    )
     limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
-    yield LIMIT, [NamedPolicy(LIMIT, trainer.policy, oracle.learned(limit))]
+    yield LIMIT, [NamedPolicy(LIMIT, trainer.policy, oracle.learned(limit), run.config.plant)]
     for name in BASELINES:
         yield name, [baseline(name, run.config.plant)]
 
@@ -71,7 +74,7 @@ def cell(row: Held, limit: Held) -> str:
 
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     """The command; several runs differ by their seeds."""
-    cli.use_compilation_cache()
+    cache.use_compilation_cache()
     opened = [RunFolder.open(path) for path in runs]
     config, plant = opened[0].config, opened[0].config.plant
     plants = [scenarios.perturbed(name) for name in scenarios.for_stability(plant)]

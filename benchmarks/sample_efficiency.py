@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 from comparison import show
-from matplotlib.figure import Figure
 
 from jaxouter import cli
-from jaxouter.evaluation import figures, scenarios
-from jaxouter.evaluation.policies import baseline, evaluate
+from jaxouter.evaluation import cache, figures, scenarios
+from jaxouter.evaluation.drawing import Figure
+from jaxouter.evaluation.policies import baseline, evaluate_on
 from jaxouter.evaluation.statistics import interval
 from jaxouter.training.run import RunFolder, surroundings, write_json
 
@@ -109,7 +109,7 @@ def draw(path: Path, found: dict[str, Curve], levels: dict[str, float], title: s
     axes.set_ylabel(f"MAE [{unit}]")
     axes.set_title(title, fontsize=10, loc="left")
     axes.legend(fontsize=7.5, framealpha=0.85)
-    figures.save(figure, path)
+    figures.save(figures.styled(figure), path)
 
 
 def spread(steps: Sequence[int | None], none: str = "never") -> str:
@@ -125,12 +125,12 @@ def main(
     plants: tyro.conf.Positional[tuple[str, ...]] = tuple(STEPS), runs: Path = Path("runs/sample-efficiency")
 ) -> None:
     """The command."""
-    cli.use_compilation_cache()
+    cache.use_compilation_cache()
     table = []
     for plant in plants:
         scenario = scenarios.get(scenarios.reported(plant)[0])
         found = curves(plant, runs)
-        simple = [evaluate(baseline(name, plant), [scenario])[scenario.id] for name in ("static", "oracle")]
+        simple = [evaluate_on(baseline(name, plant), [scenario])[scenario.id] for name in ("static", "oracle")]
         static, limit = (each.figures.mae or np.inf for each in simple)
         levels = {"static": static, f"{NEAR:g} x the limit": NEAR * limit, "limit": limit}
         rows: dict[str, Any] = {}

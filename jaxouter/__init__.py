@@ -1,5 +1,12 @@
-"""jaxouter learns an outer loop: it sees the reference r and the output y, and chooses the modified reference r~."""
+"""jaxouter learns an outer loop: it sees the reference r and the output y, and chooses the modified reference r~.
 
+run = jaxouter.learn("pitch", seed=0)
+run.plot()
+run.export("controller.c")
+jaxouter.load(run.path).policy
+"""
+
+import importlib
 import os
 import sys
 from typing import TYPE_CHECKING, Any
@@ -8,16 +15,32 @@ if sys.version_info < (3, 12):  # jaxlib 0.10 logs errors about its own compilat
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 if TYPE_CHECKING:
+    from jaxouter.agents import Agent
+    from jaxouter.library import Run, learn, load, resume
     from jaxouter.loop.environment import make
+    from jaxouter.loop.policy import Policy
+    from jaxouter.plants import Plant
 
-__all__ = ["__version__", "make"]
 __version__ = "0.1.0"
+_MODULES = {
+    "Agent": "agents",
+    "Plant": "plants",
+    "Policy": "loop.policy",
+    "Run": "library",
+    "learn": "library",
+    "load": "library",
+    "make": "loop.environment",
+    "resume": "library",
+}
+__all__ = ["Agent", "Plant", "Policy", "Run", "__version__", "learn", "load", "make", "resume"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import `make` on first use, so that an exported controller does not import JAX."""
-    if name != "make":
+    """Import a name on first use, so that an exported controller does not import JAX."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from jaxouter.loop.environment import make
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
-    return make
+
+def __dir__() -> list[str]:
+    return __all__

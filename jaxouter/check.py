@@ -16,10 +16,13 @@ import tyro
 
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures
+from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.identification import recorded_data, steady_state, validation
 from jaxouter.plants import Plant, interface, simulate
 from jaxouter.plants.registry import add
 from jaxouter.plants.simulators import PlantOptions
+from jaxouter.progress import showing
+from jaxouter.terminal import optional
 from jaxouter.training.choice import choose
 from jaxouter.training.config import preset
 
@@ -38,6 +41,8 @@ class Options:
 
     plant: Annotated[str, tyro.conf.Positional]
     """Plant: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE, an installed package's entry point, pitch or heaters."""
+    set: cli.Settings = ()
+    """Parameters of the plant, such as --set tau 0.7 or --set W 0.1 0.003 -0.01."""
     figure: Path | None = None
     """File for the figure; default: no figure."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -49,14 +54,14 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments), ExitStack() as stack:
-        options = tyro.cli(Options, prog="python -m jaxouter.check", args=arguments)
+        options = tyro.cli(Options, prog=cli.program("check"), args=arguments)
         figure = options.figure
         if figure is not None and not figure.resolve().parent.is_dir():
             raise ValueError(f"--figure is {figure}; its folder does not exist")
-        progress = stack.enter_context(cli.progress())
+        progress = stack.enter_context(showing(True))
         progress.phase("preparing")
-        plant, params = plants.make(add(options.plant, options.plant_options))
-        cli.use_compilation_cache()
+        plant, params = plants.make(add(options.plant, options.plant_options, cli.settings(options.set)))
+        use_compilation_cache()
         progress.phase("checking")
         found = [("shapes and types", None), *interface.behaviour(plant, params)]
         rows = [[what, wrong or "implemented"] for what, wrong in found]
@@ -69,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             draw = response_report(plant, params)
         if figure is not None:
             progress.phase("drawing")
-            with cli.optional("figure"):
+            with optional("figure"):
                 progress.print(f"figure: {draw(figure)}")
     if any(wrong for _, wrong in found):
         raise SystemExit(1)
@@ -82,7 +87,7 @@ def validation_report(plant: Plant, path: str) -> Callable[[Path], Path]:
     cli.table(f"{plant.name}: model validation", ["what", "is"], rows)
     for warning in found.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return lambda figure: figures.log_report(figure, found, plant.name, plant.y_unit, plant.time_unit)
+    return lambda path: figures.save(figures.log_report(found, plant.name, plant.y_unit, plant.time_unit), path)
 
 
 def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
@@ -102,7 +107,7 @@ def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
         print("warning: no r~ within its bounds holds y at every set-point", file=sys.stderr)
     for warning in choice.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return lambda figure: figures.step_responses(figure, plant, moves, responses)
+    return lambda path: figures.save(figures.step_responses(plant, moves, responses), path)
 
 
 def within_reach(plant: Plant, found: steady_state.DcGain) -> list[float]:

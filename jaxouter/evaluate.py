@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -13,11 +13,15 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.evaluation import baselines, jobs, pace, scenarios
-from jaxouter.evaluation.baselines import BASELINES, CLAIRVOYANT
-from jaxouter.evaluation.policies import NamedPolicy, Results, baseline, counter, evaluate, result, work
-from jaxouter.progress import Progress
-from jaxouter.training.run import add_agent, add_plant, open_run, write_json
+from jaxouter.evaluation import jobs, policies, scenarios
+from jaxouter.evaluation.baselines import BASELINES
+from jaxouter.evaluation.cache import use_compilation_cache
+from jaxouter.evaluation.metrics import number
+from jaxouter.evaluation.policies import Results, result
+from jaxouter.library import Run, load
+from jaxouter.plants.registry import add
+from jaxouter.progress import Progress, showing
+from jaxouter.training.run import write_json
 
 SHOWN = (
     "mae",
@@ -41,6 +45,9 @@ class Options:
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run folder, or the folder of one seed in it."""
+    set: cli.Settings = ()
+    """Parameters of the plant, such as --set tau 0.7 or --set W 0.1 0.003 -0.01, beside those that the run was trained
+    on; scenarios keep those they set."""
     plant: str | None = None
     """The run's plant, if your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; without a run, that of the policy."""
     agent: str | None = None
@@ -75,31 +82,21 @@ class Origin(NamedTuple):
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments), ExitStack() as stack:
-        options = tyro.cli(Options, prog="python -m jaxouter.evaluate", args=arguments)
+        options = tyro.cli(Options, prog=cli.program("evaluate"), args=arguments)
         if options.list:
             return cli.print_lists()
-        add_agent(options.agent)
-        if options.plant is not None:
-            options = replace(options, plant=add_plant(options.plant, options.run))
-        check(options)
-        progress = stack.enter_context(cli.progress())
+        run = check(options)
+        progress = stack.enter_context(showing(True))
         progress.phase("preparing")
-        cli.use_compilation_cache()
-        policies, origin = choose(options, progress)
-        names = options.scenario or [name for plant in policies for name in scenarios.catalogue(plant)]
-        foreign = [name for name in names if name.split("/")[0] not in policies]
-        if foreign:
-            raise ValueError(f"{options.run} is a run on {next(iter(policies))}; {foreign[0]} is another plant's")
-        rollouts = 1 if options.policy == "none" else 2
-        if pace.seconds(names, options.episodes, rollouts) > pace.SAID:
-            progress.print(f"{pace.told(names, options.episodes, rollouts)}; --episodes N is N of each")
-        selected = [scenarios.get(name, options.episodes, options.family_seed) for name in names]
-        results = evaluated(policies, selected, options.policy, progress)
-    named = next(iter(policies.values()))
-    show(named.name, results, origin.places or {})
+        use_compilation_cache()
+        results, origin = evaluated(options, run, progress), Origin()
+        if run is not None and options.policy is None:
+            origin = Origin(str(run.path), run.seed, places(run, results))
+    name = "learned" if options.policy is None else jobs.short(options.policy)
+    show(name, results, origin.places or {})
     if options.json is not None:
-        episodes = {name: len(traces.y) for name, (traces, _) in results.items()}
-        found = result(named, results, **origin._asdict(), family_seed=options.family_seed, episodes=episodes)
+        episodes = {scenario: len(found.traces.y) for scenario, found in results.items()}
+        found = result(name, results, **origin._asdict(), family_seed=options.family_seed, episodes=episodes)
         write_json(options.json, msgspec.to_builtins(found))
         print(f"figures of merit: {options.json}")
     if options.traces is not None:
@@ -109,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"traces: {options.traces}")
 
 
-def check(options: Options) -> None:
-    """Everything that can be wrong and found without work.
+def check(options: Options) -> Run | None:
+    """Everything that can be wrong and found without work; returns the run, if one is named.
 
     Raises:
         ValueError: the options do not fit together, or name what does not exist.
@@ -119,88 +116,56 @@ def check(options: Options) -> None:
         raise ValueError(
             f"say what to evaluate: a run folder, or --policy with FILE.py:CLASS or one of {', '.join(BASELINES)}"
         )
-    if options.policy == CLAIRVOYANT:
-        raise ValueError(f"{CLAIRVOYANT} is a bound, not a policy; python -m jaxouter.compare shows it")
-    if options.episodes is not None and options.episodes < 1:
-        raise ValueError(f"--episodes is {options.episodes}; it must be at least 1")
-    if not 0 <= options.family_seed < 2**32:
-        raise ValueError(f"--family-seed is {options.family_seed}; it must lie in [0, 2^32)")
+    policies.check(options.episodes, options.family_seed)
     for path in (options.json, options.traces):
         if path is not None and (path.is_dir() or not path.resolve().parent.is_dir()):
             raise ValueError(f"{path} can't be written: it must be a file in a folder that exists")
-    for name in options.scenario:
-        scenarios.builder(name)
+    if options.run is not None:
+        return load(options.run, plant=options.plant, agent=options.agent)
+    return None
 
 
-def choose(options: Options, progress: Progress) -> tuple[dict[str, NamedPolicy], Origin]:
-    """The policy for each plant, and where it comes from.
-
-    Raises:
-        ValueError: the folder is no run, or has no checkpoint.
-    """
-    if options.policy is not None:
-        every = set(plants.REGISTRY) if options.plant is None else {options.plant}
-        given = {name.split("/")[0] for name in options.scenario} or every
-        names = sorted(given) if options.run is None else [open_run(options.run)[0].config.plant]
-        return {name: chosen(options.policy, name, progress) for name in names}, Origin()
-    assert options.run is not None  # as `check` found
-    run, seed, _ = open_run(options.run)
-    named = NamedPolicy("learned", *run.policy(seed))
-    places = None
-    if run.config.randomise:
-        selected = [scenarios.get(name, 1) for name in scenarios.catalogue(run.config.plant)]
-        places = {scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected}
-    return {run.config.plant: named}, Origin(str(run.path), seed, places)
-
-
-def chosen(policy: str, plant_name: str, progress: Progress) -> NamedPolicy:
-    """The user's own policy, or a baseline, which is identified unless the cache has it; that is told.
+def evaluated(options: Options, run: Run | None, progress: Progress) -> Results:
+    """The policy on the scenarios, of one plant after the other.
 
     Raises:
-        ValueError: there is no such policy, the plant does not allow it, or it can't be made.
+        ValueError: there is no such policy, plant or scenario, or the policy failed.
     """
-    found = jobs.entrant(policy, plants.make(plant_name)[0])
-    if found.kind == "user":
-        return NamedPolicy(found.name, *jobs.load(found, plant_name))
-
-    def heard(text: str, share: float) -> None:
-        if not text:
-            note = baselines.resolve(policy).note
-            progress.print(f"{policy} on {plant_name}: {note} This is done once, and kept.")
-        elif share and not progress.done:
-            progress.phase(f"tuning {policy}")
-        progress.reach(share, at=text)
-
-    progress.phase(f"identifying {policy}", 1.0)
-    return baseline(policy, plant_name, heard)
-
-
-def evaluated(
-    policies: Mapping[str, NamedPolicy], selected: Sequence[scenarios.Scenario], asked: str | None, progress: Progress
-) -> Results:
-    """The policy of each plant on its scenarios.
-
-    Raises:
-        ValueError: a user's policy, `asked` for on the command line, failed.
-    """
-    pairs = [(policies[scenario.plant.name], scenario) for scenario in selected]
-    plants_selected = {scenario.plant.name: scenario.plant for scenario in selected}.values()
-    total = sum(work(named.name, scenario) for named, scenario in pairs)
-    progress.phase("evaluating", total, counter=counter(plants_selected))
+    policy = options.policy or (None if run is None else run.policy)
+    assert policy is not None  # as `check` found
+    if run is not None:
+        names = [run.config.plant]
+    elif options.plant is not None:
+        names = [add(options.plant)]
+    else:
+        names = list(dict.fromkeys(name.rpartition("/")[0] for name in options.scenario)) or list(plants.REGISTRY)
     results: Results = {}
-    for i, (named, scenario) in enumerate(pairs):
-        progress.say(scenario=f"{scenario.id}, {i + 1} of {len(selected)} scenarios")
-        with jobs.blamed(named.name, f"failed on {scenario.id}", jobs.is_own(asked)):
-            results |= evaluate(named, [scenario])
-        progress.advance(work(named.name, scenario))
+    for name in names:
+        of_plant = [each for each in options.scenario if len(names) == 1 or each.rpartition("/")[0] == name]
+        results |= policies.evaluate(
+            policy,
+            name,
+            of_plant,
+            set=cli.settings(options.set),
+            episodes=options.episodes,
+            family_seed=options.family_seed,
+            progress=progress,
+        )
     return results
+
+
+def places(run: Run, results: Results) -> dict[str, str] | None:
+    """Where the scenarios' plants lie among those of a training that drew its plants; None: it drew none."""
+    if not run.config.randomise:
+        return None
+    return {name: scenarios.place(scenarios.get(name, 1), *run.drawn) for name in results}
 
 
 def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     """Print the table; with where each plant lies among those of the training, where that is known."""
     rows = [
         [name, *filter(None, [places.get(name)])]
-        + ["diverged" if figures.diverged else cli.number(getattr(figures, key)) for key in SHOWN]
+        + ["diverged" if figures.diverged else number(getattr(figures, key)) for key in SHOWN]
         for name, (_, figures) in results.items()
     ]
     columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]

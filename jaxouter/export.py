@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,12 +10,9 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli
-from jaxouter.exports import c, fmu, verify
-from jaxouter.exports.spec import ControllerSpec
-from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.run import add_agent, add_plant, open_run
-
-FORMATS = ("onnx", "npz", "stablehlo", "c", "fmu")
+from jaxouter.exports import files
+from jaxouter.exports.files import FORMATS
+from jaxouter.library import Run, load
 
 
 @dataclass(frozen=True)
@@ -37,7 +31,7 @@ class Options:
     agent: str | None = None
     """The run's agent, if your own: FILE.py:CLASS."""
     format: str | None = None
-    """onnx, npz, stablehlo, c or fmu."""
+    """onnx, npz, stablehlo, c or fmu; default: that of --out."""
     out: Path | None = None
     """File to write, which must not exist; default: controller.FORMAT in the folder."""
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -48,124 +42,42 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    with cli.user_errors(arguments), ExitStack() as stack:
-        options = tyro.cli(Options, prog="python -m jaxouter.export", args=arguments)
-        run_path, kind, out = check(options)
-        run, seed, _ = open_run(run_path)
-        cli.use_compilation_cache()
-        policy, params = run.policy(seed)
-        spec = ControllerSpec.of(policy, params, run.trainer[0].env.plant)
-        progress = stack.enter_context(cli.progress())
-        place = stack.enter_context(tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent))
-        made = Path(place) / out.name
-        progress.phase("writing")
-        write(kind, made, spec, policy, params)
-        progress.phase("verifying")
-        found = verified(kind, made, spec, policy, params)
-        for path in written(kind, made):
-            path.replace(out.with_name(path.name))
+    with cli.user_errors(arguments):
+        options = tyro.cli(Options, prog=cli.program("export"), args=arguments)
+        out, run = check(options)
+        try:
+            found = run.export(out, force=options.force)
+        except ArithmeticError as error:
+            raise SystemExit(f"error: {error}") from None
+    spec = run.policy.spec
     low, high = spec.r_tilde_bounds
     print(
-        f"{spec.plant}, seed {seed}: r~ in [{low:g}, {high:g}] {spec.y_unit} from r and y in {spec.y_unit}, once every "
-        f"{spec.control_step:g} {spec.time_unit}; state: {spec.history} past y, {spec.history} past r~, integral"
+        f"{spec.plant}, seed {run.seed}: r~ in [{low:g}, {high:g}] {spec.y_unit} from r and y in {spec.y_unit}, once "
+        f"every {spec.control_step:g} {spec.time_unit}; state: {spec.history} past y, {spec.history} past r~, integral"
     )
-    for path in written(kind, out):
+    for path in files.written(out):
         print(f"written: {path} ({path.stat().st_size / 1000:.1f} kB)")
     print(found)
 
 
-def check(options: Options) -> tuple[Path, str, Path]:
-    """Check everything that can be checked quickly.
-
-    Returns:
-        Folder of the run, format, and the file to write.
+def check(options: Options) -> tuple[Path, Run]:
+    """The file to write, and the run.
 
     Raises:
-        ValueError: an option names something that is missing, exists already, or can't be made here.
+        ValueError: an option is missing, or names something that does not exist.
     """
-    kind, run = options.format, options.run
-    if run is None:
+    kind = options.format
+    if options.run is None:
         raise ValueError("say what to export: a run folder, or the folder of one seed in it")
+    if kind is None and options.out is not None:
+        kind = options.out.suffix.removeprefix(".")
     if kind not in FORMATS:
-        asked = "say --format" if kind is None else f"there is no format {kind!r}"
+        asked = "say --format" if not kind else f"there is no format {kind!r}"
         raise ValueError(f"{asked}; the formats are: {', '.join(FORMATS)}")
-    out = run / f"controller.{kind}" if options.out is None else options.out
-    add_agent(options.agent)
-    named = None if options.plant is None else add_plant(options.plant, run)
-    opened, seed, _ = open_run(run)
-    made_on = opened.config.plant
-    if named not in (None, made_on):
-        raise ValueError(f"{run} is a run on {made_on}, not on {named}")
+    out = options.run / f"controller.{kind}" if options.out is None else options.out
     if out.suffix != f".{kind}":
         raise ValueError(f"--out is {out}; for the format {kind} its name must end in .{kind}")
-    verdict = opened.verdict()
-    if seed in verdict.get("worse", ()) and not options.force:
-        raise ValueError(f"{run}, seed {seed}: {verdict['text']}")
-    for path in written(kind, out):
-        if path.exists():
-            raise ValueError(f"{path} exists; remove it, or choose another --out")
-    if not (out.parent.is_dir() and os.access(out.parent, os.W_OK)):
-        raise ValueError(f"{out} can't be written: {out.parent} must be a folder that you may write to")
-    try:
-        needed(kind)
-    except (ImportError, FileNotFoundError) as error:
-        raise ValueError(f"--format {kind} can't be made here: {error}") from None
-    return run, kind, out
-
-
-def written(kind: str, out: Path) -> list[Path]:
-    """The files of an export."""
-    return [out, out.with_suffix(".h")] if kind == "c" else [out]
-
-
-def needed(kind: str) -> None:
-    """Raises ImportError or FileNotFoundError if a requirement of the format is not installed."""
-    if kind == "onnx":
-        from jaxouter.exports import onnx  # noqa: F401
-    elif kind == "stablehlo":
-        from jaxouter.exports import stablehlo  # noqa: F401
-    elif kind == "fmu":
-        c.compiler()
-        fmu.platform_folder()
-
-
-def write(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> None:
-    """Write the controller in a format."""
-    match kind:
-        case "onnx":
-            from jaxouter.exports import onnx
-
-            onnx.save(spec, path)
-        case "npz":
-            spec.save(path)
-        case "stablehlo":
-            from jaxouter.exports import stablehlo
-
-            stablehlo.save(policy, params, path)
-        case "c":
-            c.save(spec, path)
-        case "fmu":
-            fmu.save(spec, path)
-
-
-def verified(kind: str, path: Path, spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams) -> str:
-    """Verify the file; returns the result in one line.
-
-    Raises:
-        SystemExit: it differs from the policy.
-    """
-    try:
-        found = verify.verify(kind, path, spec, policy, params)
-    except (ImportError, FileNotFoundError) as error:
-        return f"not verified: {error}"
-    text = (
-        f"largest deviations from the policy in {verify.STEPS:,} steps, as shares of the range of r~: "
-        f"{found.at_a_step:.1e} at a step, {found.in_closed_loop:.1e} in closed loop"
-    )
-    if not found.small:
-        allowed = f"{verify.AT_A_STEP:.0e} and {verify.IN_CLOSED_LOOP:.0e}"
-        raise SystemExit(f"error: nothing is written: {text}; allowed are {allowed}")
-    return f"verified: {text}"
+    return out, load(options.run, plant=options.plant, agent=options.agent)
 
 
 if __name__ == "__main__":

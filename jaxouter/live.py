@@ -17,11 +17,14 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import figures
+from jaxouter.evaluation.cache import use_compilation_cache
+from jaxouter.evaluation.metrics import number
 from jaxouter.plants.errors import Raised
 from jaxouter.plants.registry import attribute
-from jaxouter.progress import Progress
+from jaxouter.progress import Progress, showing
 from jaxouter.runtime.live_folder import SIGNALS, Declaration, LiveFolder, open_folder, reference, summary
 from jaxouter.runtime.realtime import Loop, Row, StepError, Timing, run
+from jaxouter.terminal import Interrupt, optional
 from jaxouter.training.run import add_agent, add_plant, write_json
 
 KEPT = {"static": "static inverse", "trained": "as trained"}
@@ -66,13 +69,13 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments), ExitStack() as stack:
-        options = tyro.cli(Options, prog="python -m jaxouter.live", args=arguments)
+        options = tyro.cli(Options, prog=cli.program("live"), args=arguments)
         plant = check(options)
         add_agent(options.agent)
         if options.plant is not None:
             add_plant(options.plant, options.run)
         folder = open_folder(options.run, options.declaration, options.learn)
-        cli.use_compilation_cache()
+        use_compilation_cache()
         live, state = folder.begin()
         own, declared = folder.declaration, live.env.plant
         r = reference(options.reference, declared.setpoint_range, own.episode_steps, own.seed)
@@ -122,7 +125,7 @@ def check(options: Options) -> Callable[[float], Any]:
 def go(folder: LiveFolder, loop: Loop, steps: int | None) -> str | None:
     """Run with progress, then save; returns why it ended early, or None."""
     stopped = None
-    with cli.Interrupt("everything is saved") as interrupt, cli.progress() as progress, folder.rows() as rows:
+    with Interrupt("everything is saved") as interrupt, showing(True) as progress, folder.rows() as rows:
         progress.phase("running", steps or 0)
         tell = Telling(loop, progress)
 
@@ -183,7 +186,7 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     cli.table(
         "MAE: measured, and predicted for other policies on the same steps",
         ["", "measured", "r~ = r", KEPT[loop.live.kept], "learned"],
-        [[part, *(cli.number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
+        [[part, *(number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
     )
     passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)
     act = found["act_us"]
@@ -191,8 +194,8 @@ def report(folder: LiveFolder, loop: Loop) -> None:
         f"{found['steps']:,} steps ({passed}); {found['missed_deadlines']:,} missed deadlines; {found['updates']:,} "
         f"updates; act takes {act['p50']:.0f} us (p50), {act['p99']:.0f} us (p99)"
     )
-    with cli.optional("figure"):
-        print(f"figure: {figures.live(folder.path / 'live.png', columns, unit)}")
+    with optional("figure"):
+        print(f"figure: {figures.save(figures.live(columns, unit), folder.path / 'live.png')}")
     print(f"summary, steps.csv and controller.npz: {folder.path}")
 
 

@@ -6,13 +6,17 @@ import importlib.util
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
+import jax
 from rich import progress as bars
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Column
 from rich.text import Text
+
+from jaxouter.terminal import console
 
 LINE_SECONDS = 5.0  # between two plain lines, at most
 FIRST = 0.1  # a first piece smaller than this share of the work is mostly compilation and does not give the pace
@@ -47,6 +51,17 @@ class TimeLeft:
         if self._pace is None:
             return None
         return max(0.0, self._pace * (self.total - self.done) - (now - (self._last or now)))
+
+
+@contextmanager
+def showing(progress: bool | Progress) -> Iterator[Progress]:
+    """Progress on the console (True), none (False), or that which is shown already."""
+    if isinstance(progress, Progress):
+        yield progress
+        return
+    jax.devices()  # a missing platform is reported before anything else
+    with Progress(console, progress) as begun:
+        yield begun
 
 
 class Progress:

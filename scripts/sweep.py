@@ -22,8 +22,8 @@ import jax
 import tyro
 
 from jaxouter import cli
-from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.policies import NamedPolicy, evaluate
+from jaxouter.evaluation import cache, scenarios
+from jaxouter.evaluation.policies import NamedPolicy, evaluate_on
 from jaxouter.training.run import RunFolder
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
@@ -60,8 +60,11 @@ def line(name: str, run: RunFolder) -> list[str]:
     """Variant, seeds, median MAE of each scenario, and seconds per seed for the whole command."""
     trainer, _ = run.trainer
     selected = [scenarios.get(identifier) for identifier in selected_on(run.config.plant)]
-    policies = [NamedPolicy("learned", trainer.policy, trainer.policy_params(run.load(seed)[0])) for seed in run.seeds]
-    found = [evaluate(policy, selected) for policy in policies]
+    policies = [
+        NamedPolicy("learned", trainer.policy, trainer.policy_params(run.load(seed)[0]), run.config.plant)
+        for seed in run.seeds
+    ]
+    found = [evaluate_on(policy, selected) for policy in policies]
     of_each = [[results[scenario.id].figures.mae for results in found] for scenario in selected]
     seconds = (run.path / "seconds").read_text()
     return [name, str(run.config.seeds), *(f"{statistics.median(maes):.3f}" for maes in of_each), seconds]
@@ -81,7 +84,7 @@ def train(plant: str, name: str, options: Options) -> None:
 
 def main(options: Options) -> None:
     """The command."""
-    cli.use_compilation_cache()
+    cache.use_compilation_cache()
     text = [
         "# What was tried, and what it gave",
         "",

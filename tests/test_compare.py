@@ -17,11 +17,12 @@ import msgspec
 import pytest
 import tyro
 
-from jaxouter import cli, compare, evaluate
-from jaxouter.evaluation import scenarios, sweeps
+from jaxouter import compare, evaluate
+from jaxouter.evaluation import comparison, scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
-from jaxouter.evaluation.comparison import Comparison
+from jaxouter.evaluation.results import Comparison
 from jaxouter.plants import REGISTRY
+from jaxouter.progress import showing
 from jaxouter.training.run import RunFolder, write_json
 from tests import interrupts, lag
 from tests.training.small import small
@@ -187,16 +188,18 @@ def test_baselines_come_from_the_cache_the_second_time(compared, tmp_path, monke
         (before,) = compared.rows(row["policy"])
         ranked = ("rank", "best")  # among other policies
         assert {k: v for k, v in row.items() if k not in ranked} == {k: v for k, v in before.items() if k not in ranked}
-    assert compare.folder(None, "pitch") == Path("runs/compare-pitch-2")
+    assert comparison.folder(None, "pitch") == Path("runs/compare-pitch-2")
 
 
 def test_where_nothing_can_be_drawn_all_else_is_written(compared, tmp_path, capsys, monkeypatch):
     def draw(*_: object) -> None:
         raise RuntimeError("no fonts")
 
-    monkeypatch.setattr(compare.comparison_figures, "draw", draw)
+    monkeypatch.setattr(comparison.comparison_figures, "draw", draw)
     content = msgspec.convert(compared.content, Comparison)
-    page = compare.write(compare.Plan("pitch", (), (), (), 0, tmp_path), content, [], cli.progress())
+    selected = comparison.Selection("pitch", (), (), (), 0, tmp_path)
+    with showing(True) as progress:
+        page = comparison.write(selected, content, [], progress)
     assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
     assert "outer loops compared" in page.read_text(encoding="utf-8")
     assert json.loads((tmp_path / "comparison.json").read_text()) == compared.content
@@ -242,13 +245,13 @@ def place(tmp_path, monkeypatch):
         (["--policy", "fails.py:Lead"], "fails.py can't be imported: ZeroDivisionError: division by zero"),
         (["--scenario", "pitch/papers"], "there is no scenario 'pitch/papers'; pitch has: pitch/paper, "),
         (["--scenario", "boat/paper"], "there is no plant 'boat'"),
-        (["--scenario", "pitch/paper", "heaters/cold"], "the comparison is on pitch; heaters/cold is another plant's"),
+        (["--scenario", "pitch/paper", "heaters/cold"], "the plant is pitch; heaters/cold is another plant's"),
         (["--sweep", "pitch/gains"], "there is no sweep 'pitch/gains'; pitch has: pitch/pilot-delay, "),
-        (["--sweep", "heaters/houses"], "the comparison is on pitch; heaters/houses is another plant's"),
+        (["--sweep", "heaters/houses"], "the plant is pitch; heaters/houses is another plant's"),
         (["--run", "nowhere"], "nowhere is not a run folder"),
         (["--run", "heated/seed-0", "."], ". is not a run folder"),
         (["pitch", "--run", "heated"], "heated is a run on heaters; the comparison is on pitch"),
-        (["--run", "heated", "--scenario", "pitch/paper"], "the comparison is on heaters; pitch/paper is another"),
+        (["--run", "heated", "--scenario", "pitch/paper"], "the plant is heaters; pitch/paper is another"),
         (["--family-seed", "-1"], "--family-seed is -1; it must lie in [0, 2^32)"),
         (["--out", "."], ". exists; choose another --out"),
         (
@@ -298,43 +301,42 @@ def test_bad_input_leaves_no_traceback(tmp_path):
 
 
 def test_everything_is_the_default(place, monkeypatch):
-    plan = compare.check(compare.Options())
-    assert (plan.plant, plan.out) == ("pitch", Path("runs/compare-pitch"))
-    assert [c.name for c in plan.entrants] == list(NAMES)
-    assert plan.scenarios == tuple(scenarios.catalogue("pitch"))
-    assert plan.sweeps == tuple(sweeps.catalogue("pitch"))
+    selected = comparison.select()
+    assert (selected.plant, selected.out) == ("pitch", Path("runs/compare-pitch"))
+    assert [c.name for c in selected.entrants] == list(NAMES)
+    assert selected.scenarios == tuple(scenarios.catalogue("pitch"))
+    assert selected.sweeps == tuple(sweeps.catalogue("pitch"))
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     run = RunFolder.create(small("lag"), Path("lagging"))
     trainer, params = run.trainer
     run.save(0, 1, trainer.start(0, params))
-    plan = compare.check(compare.Options(run=(run.path,), policy=("lead.py:Lead",)))
-    assert (plan.plant, plan.out) == ("lag", Path("runs/compare-lag"))
-    assert [c.name for c in plan.entrants] == ["learned", "lead.py:Lead", *NAMES]
+    selected = comparison.select(runs=[run.path], policies=["lead.py:Lead"])
+    assert (selected.plant, selected.out) == ("lag", Path("runs/compare-lag"))
+    assert [c.name for c in selected.entrants] == ["learned", "lead.py:Lead", *NAMES]
 
 
 def test_inner_loop_alone_is_always_there_and_no_policy_twice(run):
-    plan = compare.check(compare.Options(policy=("pi", "clairvoyant", "pi")))
-    assert [(c.name, c.kind) for c in plan.entrants] == [
+    selected = comparison.select(policies=["pi", "clairvoyant", "pi"])
+    assert [(c.name, c.kind) for c in selected.entrants] == [
         ("none", "baseline"), ("pi", "baseline"), ("clairvoyant", "preview"),
     ]  # fmt: skip
-    plan = compare.check(compare.Options(run=(run.path,), policy=("none",)))
-    assert [(c.name, c.seed) for c in plan.entrants] == [("learned", 1), ("learned", 0), ("none", None)]
-    plan = compare.check(compare.Options(run=(run.path / "seed-0",), policy=("none",)))
-    assert [c.seed for c in plan.entrants] == [0, None]
+    selected = comparison.select(runs=[run.path], policies=["none"])
+    assert [(c.name, c.seed) for c in selected.entrants] == [("learned", 1), ("learned", 0), ("none", None)]
+    selected = comparison.select(runs=[run.path / "seed-0"], policies=["none"])
+    assert [c.seed for c in selected.entrants] == [0, None]
 
 
 def test_what_is_named_twice_counts_once_and_files_of_one_name_are_told_apart(run, place):
     Path("other").mkdir()
     shutil.copy(LEAD, "other/lead.py")
-    options = compare.Options(
-        run=(run.path / "seed-0", run.path / "seed-0"),
-        policy=("none", "lead.py:Lead", "other/lead.py:Lead", "lead.py:Lead"),
-        scenario=("pitch/paper", "pitch/paper"),
-        sweep=("pitch/gain", "pitch/gain"),
+    selected = comparison.select(
+        runs=[run.path / "seed-0", run.path / "seed-0"],
+        policies=["none", "lead.py:Lead", "other/lead.py:Lead", "lead.py:Lead"],
+        scenario=["pitch/paper", "paper"],
+        sweep=["gain", "pitch/gain"],
     )
-    plan = compare.check(options)
-    assert [c.name for c in plan.entrants] == ["learned", "lead.py:Lead", "other/lead.py:Lead", "none"]
-    assert (plan.scenarios, plan.sweeps) == (("pitch/paper",), ("pitch/gain",))
+    assert [c.name for c in selected.entrants] == ["learned", "lead.py:Lead", "other/lead.py:Lead", "none"]
+    assert (selected.scenarios, selected.sweeps) == (("pitch/paper",), ("pitch/gain",))
 
 
 def test_ctrl_c_ends_it_with_130_and_leaves_nothing(tmp_path):
@@ -367,7 +369,9 @@ def test_ctrl_c_ends_it_with_130_and_leaves_nothing(tmp_path):
 def test_sweep_without_a_name_is_no_sweep(arguments, wanted):
     options = tyro.cli(compare.Options, args=arguments)
     assert options.sweep == wanted
-    assert compare.check(options).sweeps == (tuple(sweeps.catalogue("pitch")) if wanted is None else wanted)
+    assert comparison.select(sweep=options.sweep).sweeps == (
+        tuple(sweeps.catalogue("pitch")) if wanted is None else wanted
+    )
 
 
 def test_list_names_sweeps_and_all_policies(capsys):

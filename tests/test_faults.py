@@ -83,9 +83,9 @@ def test_a_second_run_into_one_folder_is_refused(tmp_path):
 def test_half_an_entry_of_the_compilation_cache_is_made_anew_without_a_word(tmp_path):
     """As a kill while it is written leaves it: JAX alone would warn and compile again in each later process."""
     lines = [
-        "from jaxouter import cli",
+        "from jaxouter.evaluation import cache",
         "import jax",
-        "cli.use_compilation_cache()",
+        "cache.use_compilation_cache()",
         'jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)',
         "print(jax.jit(lambda x: 2 * x + 1)(20.5))",
     ]

@@ -39,7 +39,7 @@ def test_default_on_a_plant_of_ones_own_beats_static_and_pi_on_every_family(tmp_
     with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         figures = learned(f"{ROOT}/scripts/examples/tanks.py:Tanks", tmp_path)
         for baseline in (policies.baseline(name, "Tanks") for name in ("static", "pi")):
-            for identifier, (_, of_baseline) in policies.evaluate(baseline, map(scenarios.get, figures)).items():
+            for identifier, (_, of_baseline) in policies.evaluate_on(baseline, map(scenarios.get, figures)).items():
                 assert figures[identifier]["mae"] < 0.5 * of_baseline.mae
 
 

@@ -15,8 +15,9 @@ from rich.console import Console
 from jaxouter import cli, compare, evaluate, progress, train
 from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
-from jaxouter.evaluation.comparison import Comparison, PolicyInfo, Row, Summary
 from jaxouter.evaluation.metrics import FiguresOfMerit
+from jaxouter.evaluation.results import Comparison, PolicyInfo, Row, Summary
+from jaxouter.library import learning as learning_
 from jaxouter.plants import REGISTRY, host
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset
@@ -216,8 +217,8 @@ class Heard:
 
 def begun(clock, config, plant, flop=(10.0, 1.0)):
     of = Progress(Console(file=io.StringIO(), force_terminal=True, width=80), clock=clock)
-    with patch.object(train, "arithmetic", lambda config: flop):
-        return of, train.Learning(of, config, plant, "lag/steps")
+    with patch.object(learning_, "arithmetic", lambda config: flop):
+        return of, learning_.Learning(of, config, plant, "lag/steps")
 
 
 def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
@@ -263,9 +264,9 @@ def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
 @pytest.mark.parametrize(("plant", "there"), [("pitch", True), ("lag", False)])
 def test_the_papers_column_is_for_its_plants_alone(plant, there, monkeypatch, capsys):
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
-    selected = [scenarios.get(name, 1) for name in scenarios.reported(plant)]
-    results = {scenario.id: evaluation.ScenarioResult(None, FiguresOfMerit(mae=1.0)) for scenario in selected}
-    train.show(selected, {"none": results, "static": results}, {0: results}, {})
+    figures = dict.fromkeys(scenarios.reported(plant), FiguresOfMerit(mae=1.0))
+    results = [evaluation.Evaluation(policy=name, scenarios=figures) for name in ("learned", "none", "static")]
+    train.show(SimpleNamespace(results=results, episodes=figures, places={}), preset(plant))
     assert ("paper's DRL" in capsys.readouterr().out) == there
 
 
@@ -273,7 +274,7 @@ def comparison(*rows):
     infos = {row.policy: PolicyInfo("baseline") for row in rows}
     return Comparison(
         plant="lag", y_unit="1", time_unit="s", family_seed=0, date="", machine={}, policies=infos, rows=list(rows),
-        statistics=Summary([], {}, {}), sweeps={}, stability=[], seconds=0.0, command="",
+        statistics=Summary([], {}, {}), sweeps={}, stability=[], seconds=0.0, command="", folder="",
     )  # fmt: skip
 
 
@@ -292,7 +293,8 @@ def test_comparison_explains_only_what_is_there(capsys):
 
 def test_bold_is_explained_where_it_can_be_seen(monkeypatch, capsys):
     out = io.StringIO()
-    monkeypatch.setattr(cli, "console", Console(file=out, force_terminal=True, width=80))
+    for module in (cli, compare):
+        monkeypatch.setattr(module, "console", Console(file=out, force_terminal=True, width=80))
     compare.show(comparison(row("none", 2.0, best=True)))
     assert capsys.readouterr().out == "Bold: best without the model.\n"
     assert "2*" not in STYLE.sub("", out.getvalue())
@@ -339,11 +341,11 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
             clock.now += 5
             report(f"{share:.0%} of it", share)
         said.append(of.line)
-        return evaluation.NamedPolicy(name, None, ())
+        return evaluation.NamedPolicy(name, None, (), plant)
 
     said = []
-    monkeypatch.setattr(evaluate, "baseline", slow)
-    evaluate.chosen("oracle", "pitch", of)
+    monkeypatch.setattr(evaluation, "baseline", slow)
+    evaluation.named("oracle", "pitch", of)
     identifying, told, tuning = out.getvalue().splitlines()
     assert (identifying, tuning) == ("identifying oracle", "tuning oracle")
     assert told.startswith("oracle on pitch: The learner's actor, trained by back-propagation through the simulator.")
@@ -391,8 +393,8 @@ def test_ctrl_c_after_the_learning_says_how_to_go_on(monkeypatch, tmp_path, caps
         raise KeyboardInterrupt
 
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
-    monkeypatch.setattr(train, "learn", lambda *_: {})
-    monkeypatch.setattr(train, "report", interrupted)
+    monkeypatch.setattr(learning_, "_trained", lambda *_: {})
+    monkeypatch.setattr(learning_, "report", interrupted)
     with pytest.raises(SystemExit) as end:
         train.main(["lag", "--out", str(tmp_path / "run")])
     assert end.value.code == 130

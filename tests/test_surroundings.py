@@ -15,7 +15,7 @@ import jax
 import pytest
 from rich.console import Console
 
-from jaxouter import cli
+from jaxouter import cli, terminal
 from jaxouter.evaluation import cache, drawing
 from tests.load import ROOT
 
@@ -91,7 +91,8 @@ def test_without_home_and_cache_folder_functions_are_compiled_and_a_line_says_so
         for _ in range(2):
             with warnings.catch_warnings():
                 warnings.simplefilter("default")
-                cli.use_compilation_cache()
+                warnings.showwarning = terminal.show
+                cache.use_compilation_cache()
         assert not jax.config.values["jax_compilation_cache_dir"]
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
@@ -170,7 +171,7 @@ def test_signals_are_left_alone_where_they_cannot_or_must_not_be_handled():
 
     def enter() -> None:
         try:
-            with cli.Interrupt() as interrupt:
+            with terminal.Interrupt() as interrupt:
                 assert not interrupt.requested
         except Exception as error:
             errors.append(error)
@@ -181,7 +182,7 @@ def test_signals_are_left_alone_where_they_cannot_or_must_not_be_handled():
     assert errors == []
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with cli.Interrupt():
+        with terminal.Interrupt():
             assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
             assert signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, before[signal.SIGTERM])
     finally:
@@ -191,7 +192,7 @@ def test_signals_are_left_alone_where_they_cannot_or_must_not_be_handled():
 
 def test_output_that_nobody_reads_is_dropped(monkeypatch):
     reading, writing = os.pipe()
-    stream = cli.Lasting(os.fdopen(writing, "w"))
+    stream = terminal.Lasting(os.fdopen(writing, "w"))
     monkeypatch.setattr(sys, "stdout", stream)
     os.close(reading)
     for _ in range(3):
@@ -204,7 +205,7 @@ def test_output_that_nobody_reads_is_dropped(monkeypatch):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_output_that_cannot_be_written_is_said_once(monkeypatch, capsys):
     with open("/dev/full", "w") as full:
-        monkeypatch.setattr(sys, "stdout", cli.Lasting(full))
+        monkeypatch.setattr(sys, "stdout", terminal.Lasting(full))
         for _ in range(3):
             print("x" * 10, flush=True)
     assert capsys.readouterr().err == (
@@ -223,15 +224,15 @@ def test_a_program_without_error_output_whose_reader_leaves_ends_well(tmp_path):
 def test_streams_that_are_closed_from_the_start_take_everything(monkeypatch):
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
-    assert not cli.on_terminal()
-    cli.last()
+    assert not terminal.on_terminal()
+    terminal.last()
     for stream in (sys.stdout, sys.stderr):
         print("°", file=stream, flush=True)
         stream.close()
 
 
 def test_a_failure_that_ends_nothing_is_told_in_a_line(capsys):
-    with cli.optional("figures"):
+    with terminal.optional("figures"):
         raise RuntimeError("no fonts\nand much more")
     assert capsys.readouterr().err == "warning: no figures: RuntimeError: no fonts\n"
 
@@ -248,7 +249,7 @@ def test_a_file_that_cannot_be_written_ends_a_program_with_one_line(monkeypatch)
 
 def test_a_compilation_cache_that_cannot_be_written_is_said_once(capsys):
     for i in range(3):
-        cli.show(f"Error writing persistent compilation cache entry for 'jit_f{i}': PermissionError")
+        terminal.show(f"Error writing persistent compilation cache entry for 'jit_f{i}': PermissionError")
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
@@ -256,7 +257,7 @@ def test_a_compilation_cache_that_cannot_be_written_is_said_once(capsys):
 def test_columns_are_as_many_as_text_needs(monkeypatch, given, found):
     monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((80, 24)))
     monkeypatch.setenv("COLUMNS", given)
-    cli.set_columns()
+    terminal.set_columns()
     assert os.environ["COLUMNS"] == str(found)
 
 

@@ -15,10 +15,9 @@ import pytest
 import scipy.sparse as sp
 
 from jaxouter import check, compare, evaluate, plants, train
-from jaxouter.cli import number
 from jaxouter.evaluation.baselines import clairvoyant
 from jaxouter.evaluation.baselines.qp import Condensed, Solver
-from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.metrics import figures_of_merit, number
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import rewards

@@ -68,6 +68,13 @@ def _unusable(why: str) -> None:
     warnings.warn(f"{why}; nothing that is compiled or tuned is kept, and the next start takes as long", stacklevel=4)
 
 
+def use_compilation_cache() -> None:
+    """Keep compiled functions in the user's cache folder, unless JAX is configured otherwise."""
+    if not jax.config.values["jax_compilation_cache_dir"] and (folder := usable()) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
+
+
 @lru_cache(maxsize=1)
 def code() -> str:
     """Hash of all source that results depend on, and of the version of JAX."""

@@ -1,131 +1,275 @@
-"""The content of comparison.json."""
+"""Every policy beside its baselines and beside the limit, on every scenario: results, statistics, figures, report."""
 
 from __future__ import annotations
 
+import csv
+import datetime
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from msgspec import Struct
+import msgspec
+from msgspec.structs import replace
 
-from jaxouter.evaluation.baselines import Kind
+from jaxouter import plants
+from jaxouter.evaluation import cache, comparison_figures, jobs, pace, report, scenarios, statistics, sweeps
+from jaxouter.evaluation.baselines import BUDGET, SIMPLE
+from jaxouter.evaluation.jobs import Done, Entrant, Job
 from jaxouter.evaluation.metrics import FiguresOfMerit
-from jaxouter.evaluation.stability import LocalStability
-from jaxouter.tasks import Axis
+from jaxouter.evaluation.policies import check
+from jaxouter.evaluation.results import Comparison
+from jaxouter.plants import Plant, host
+from jaxouter.plants.registry import REGISTRATIONS, Maker, own_errors
+from jaxouter.progress import Progress, showing
+from jaxouter.terminal import optional
+from jaxouter.training.run import RUNS, add_agent, add_plant, open_run, own_agents, surroundings, write_json
 
-FORMAT = 1
-Interval = tuple[float, float]  # lowest and highest value
-
-
-class PolicyInfo(Struct, frozen=True):
-    """What a policy is, and what its identification and tuning took."""
-
-    kind: Kind
-    steps: int | None = None  # environment steps
-    seconds: float | None = None
-    settings: dict[str, Any] = {}
-    note: str = ""
+COLUMNS = ("policy", "run", "seed", "scenario", "mae", "ratio_to_limit", "ratio_to_bound", "within_limits")
+COLUMNS += ("worse_than_static", *FiguresOfMerit.__struct_encode_fields__[:-1])  # `diverged` only where it is
+OVERALL = 3  # figures of all scenarios: errors, effort, stability
+REPORT = "report.html"
 
 
-class Row(FiguresOfMerit, frozen=True):
-    """One policy, or one seed of a run, on one scenario."""
+@dataclass(frozen=True)
+class Selection:
+    """What is compared, on what."""
 
-    policy: str
-    run: str | None  # folder
-    seed: int | None
-    scenario: str
-    ratio_to_limit: float | None  # MAE over that of the oracle
-    ratio_to_bound: float | None  # MAE over that of the policy with preview
-    within_limits: bool
-    worse_than_static: float | None  # share of the episodes whose MAE is above that of `static`
-    rank: int | None = None  # by MAE on the scenario; None where not ranked
-    best: bool = False  # whether the rank is 1
-
-
-class GridErrors(Struct, frozen=True):
-    """MAE of one policy over the grid of a sweep."""
-
-    values: list[list[float]]  # of the parameters, a list an axis
-    mae: list[Any]  # a nested list an axis; None where diverged
-
-    @property
-    def grid(self) -> np.ndarray:
-        """MAE, of the grid's shape; nan where diverged."""
-        return np.array(self.mae, float)
-
-
-class BestBaseline(GridErrors, frozen=True):
-    """The least MAE of all baselines over the points of a sweep that they have in common."""
-
-    policy: list[Any]  # that has it, nested as the MAE; None where every baseline diverged
-
-
-class SweepErrors(Struct, frozen=True):
-    """A sweep under every policy."""
-
-    axes: tuple[Axis, ...]  # one or two
-    policies: dict[str, GridErrors]  # by label
-    best_baseline: BestBaseline | None = None
-
-
-class StabilityRow(LocalStability, frozen=True, kw_only=True):
-    """Local stability of one policy on the plant of one scenario, at one set-point."""
-
-    policy: str  # label
-    scenario: str
-
-
-class Location(Struct, frozen=True):
-    """Median and interquartile mean over seeds, with 95 % intervals; None where missing or infinite."""
-
-    median: float | None = None
-    median_interval: Interval | None = None
-    iqm: float | None = None
-    iqm_interval: Interval | None = None
-
-
-class Improvement(Struct, frozen=True):
-    """Probability that a seed of one line has a lower error than one of another."""
-
-    probability: float
-    interval: Interval | None  # 95 %; None where both have one seed
-
-
-class LineSummary(Struct, frozen=True):
-    """What is said of one line over seeds; of its ranks None where it is not ranked at all."""
-
-    policy: str
-    run: str | None
-    kind: Kind
-    seeds: int
-    mean_rank: float | None  # over all scenarios; without a rank it counts as the last
-    first: int | None  # scenarios in which it has rank 1
-    unranked: int | None  # scenarios in which it has no rank
-    scenarios: dict[str, Location]  # of the MAE's ratio to the limit, by scenario
-    mean: Location  # over the scenarios with a limit
-
-
-class Summary(Struct, frozen=True):
-    """Everything that is said over seeds."""
-
-    scenarios: list[str]  # those with a limit
-    lines: dict[str, LineSummary]  # by label
-    improvement: dict[str, dict[str, Improvement]]  # of each learned line over each baseline or user's line
-
-
-class Comparison(Struct, frozen=True, kw_only=True):
-    """A comparison of policies on one plant."""
-
-    format: int = FORMAT
     plant: str
-    y_unit: str
-    time_unit: str
+    entrants: tuple[Entrant, ...]
+    scenarios: tuple[str, ...]
+    sweeps: tuple[str, ...]
     family_seed: int
-    date: str  # ISO
-    machine: dict[str, Any]
-    policies: dict[str, PolicyInfo]
-    rows: list[Row]
-    statistics: Summary
-    sweeps: dict[str, SweepErrors]
-    stability: list[StabilityRow]
-    seconds: float
-    command: str
+    out: Path
+
+
+def compare(
+    plant: str | Maker | None = None,
+    runs: Sequence[Path | str] = (),
+    policies: Sequence[str] = (),
+    scenario: Sequence[str] = (),
+    sweep: Sequence[str] | None = None,
+    *,
+    set: Mapping[str, Any] | None = None,
+    agents: Sequence[str] = (),
+    family_seed: int = scenarios.FAMILY_SEED,
+    out: Path | str | None = None,
+    progress: bool | Progress = True,
+    command: str = "jaxouter.evaluation.compare",
+) -> Comparison:
+    """Compare policies with their baselines, with the limit and with a lower bound, and write a report.
+
+    Args:
+        plant: as a command names it; None: that of the runs, or pitch.
+        runs: run folders (all seeds), or folders of one seed.
+        policies: baselines and limits, or `FILE.py:CLASS`; empty: all. `none` always takes part.
+        scenario: ids, such as `pitch/paper` or `paper`; empty: all of the plant.
+        sweep: ids, such as `pitch/gain` or `gain`; None: all of the plant; empty: none.
+        set: parameters of the plant; scenarios that set one themselves keep theirs.
+        agents: agents of the runs, if your own.
+        family_seed: of the families of references.
+        out: new folder for the report, its figures and data; None: runs/compare-PLANT.
+        progress: whether to show progress.
+        command: what the report says that made it.
+
+    Returns:
+        All results, as in comparison.json; `folder` holds the report.
+
+    Raises:
+        ValueError: something named does not exist, does not fit together, or failed.
+    """
+    begun = time.perf_counter()
+    with own_errors():
+        selection = select(plant, runs, policies, scenario, sweep, set, agents, family_seed, out)
+        cache.use_compilation_cache()
+        try:
+            selection.out.mkdir(parents=True)
+        except OSError as error:
+            raise ValueError(f"the folder {selection.out} can't be made: {error.strerror}") from None
+        with showing(progress) as progress:
+            try:
+                done = work(selection, progress)
+            except BaseException:
+                selection.out.rmdir()  # still empty, and its name is wanted again
+                raise
+            progress.phase("statistics", 0)
+            content = assemble(selection, done, command, begun)
+            write(selection, content, done, progress)
+    return content
+
+
+def select(
+    plant: str | Maker | None = None,
+    runs: Sequence[Path | str] = (),
+    policies: Sequence[str] = (),
+    scenario: Sequence[str] = (),
+    sweep: Sequence[str] | None = None,
+    set: Mapping[str, Any] | None = None,
+    agents: Sequence[str] = (),
+    family_seed: int = scenarios.FAMILY_SEED,
+    out: Path | str | None = None,
+) -> Selection:
+    """Resolve everything that is named, before any work; arguments as for `compare`.
+
+    Raises:
+        ValueError: the arguments do not fit together, or name what does not exist.
+    """
+    check(None, family_seed)
+    for reference in agents:
+        add_agent(reference)
+    paths = [Path(path) for path in runs]
+    named_plant = None if plant is None else add_plant(plant, *paths[:1] or (None,))
+    opened = [open_run(path) for path in paths]
+    name = plants.with_parameters(named_plant or (opened[0][0].config.plant if opened else "pitch"), set or {})
+    for path, (run, _, _) in zip(paths, opened, strict=True):
+        if plants.base(run.config.plant) != plants.base(name):
+            raise ValueError(f"{path} is a run on {run.config.plant}; the comparison is on {name}")
+    chosen = scenarios.identifiers(name, scenario)
+    swept = list(sweeps.catalogue(name)) if sweep is None else sweeps.identifiers(name, sweep)
+    entrants = [
+        Entrant("learned", "learned", str(run.path), seed)
+        for run, median, of_run in opened
+        for seed in (of_run if len(of_run) == 1 else sorted(of_run, key=lambda seed: seed != median))
+    ]
+    entrants = list(dict.fromkeys([*entrants, *named(policies, plants.make(name)[0])]))
+    for entrant in entrants:
+        if entrant.kind in ("learned", "user"):
+            jobs.load(entrant, name)  # what can't be loaded is said before minutes of tuning
+    return Selection(name, tuple(entrants), tuple(chosen), tuple(swept), family_seed, folder(out, name))
+
+
+def named(names: Sequence[str], plant: Plant) -> list[Entrant]:
+    """The policies with these names, and a user's own; where no name is given, all that the plant allows.
+
+    Raises:
+        ValueError: there is no such policy or file, or the plant does not allow it.
+    """
+    own, built_in = [], []
+    for name in dict.fromkeys(names):
+        found = jobs.entrant(name, plant)
+        if jobs.is_own(name):
+            same = found.kind == "user" and any(
+                found.name == other.name for other in own
+            )  # of several files with this name
+            own.append(found._replace(name=name) if same else found)
+        else:
+            built_in.append(name)
+    chosen = [name for name in jobs.possible(plant) if name == "none" or not built_in or name in built_in]
+    return own + [jobs.entrant(name, plant) for name in chosen]
+
+
+def folder(out: Path | str | None, plant: str) -> Path:
+    """The folder to write to; by default runs/compare-PLANT, with -2, -3, ... where that exists.
+
+    Raises:
+        ValueError: `out` exists.
+    """
+    if out is not None:
+        if Path(out).exists():
+            raise ValueError(f"{out} exists; choose another --out")
+        return Path(out)
+    base = RUNS / f"compare-{plants.slug(plant)}"
+    return next(p for p in (base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))) if not p.exists())
+
+
+def told(selection: Selection) -> str | None:
+    """How long a plant outside JAX is going to take, where that is long."""
+    each = host.step_seconds(plants.make(selection.plant)[0])
+    if each is None:
+        return None
+    tuned = [c for c in selection.entrants if c.kind == "baseline" and c.name not in SIMPLE]
+    seconds = each * BUDGET * len(tuned) + pace.seconds(selection.scenarios, None, len(selection.entrants))
+    seconds /= min(os.cpu_count() or 1, len(selection.entrants))
+    if seconds < pace.SAID:
+        return None
+    return (
+        f"the plant takes {1e3 * each:.2g} ms a control step: up to {pace.duration(seconds)}, where nothing of it is "
+        "in the cache; --policy and --scenario take fewer"
+    )
+
+
+def work(selection: Selection, progress: Progress) -> list[Done]:
+    """All jobs done, in their order, with progress."""
+    if (text := told(selection)) is not None:
+        progress.print(text)
+    every = jobs.jobs(selection.plant, selection.entrants, selection.scenarios, selection.sweeps, selection.family_seed)
+    done: dict[Job, Done] = {}
+    shares: dict[Job, float] = {}  # of each that has begun
+    progress.phase("comparing", sum(job.work for job in every))
+
+    def heard(job: Job, text: str, share: float) -> None:
+        shares[job] = share
+        progress.reach(
+            sum(share * job.work for job, share in shares.items()),
+            count=f"{len(done)} of {len(every)} jobs",
+            job=f"{job}: {text}" if text else str(job),
+        )
+
+    for finished in jobs.spread(every, partial(jobs.prepare, tuple(REGISTRATIONS.values()), own_agents()), heard):
+        done[finished.job] = finished
+        heard(finished.job, f"{finished.seconds:.0f} s", 1.0)
+    return [done[job] for job in every]
+
+
+def assemble(selection: Selection, done: Sequence[Done], command: str, begun: float) -> Comparison:
+    """What the jobs gave, with its statistics.
+
+    Args:
+        selection, done: what was asked for, and all of it done.
+        command: of the user.
+        begun: when, of `time.perf_counter`.
+    """
+    known = jobs.policies(selection.entrants, done)
+    rows = statistics.ranks(jobs.rows(done), known)
+    label = {(line.policy, line.run): line.label for line in statistics.lines(rows, known)}
+    plant, _ = plants.make(selection.plant)
+    swept = jobs.swept(done, selection.sweeps, label)
+    return Comparison(
+        plant=selection.plant,
+        y_unit=plant.y_unit,
+        time_unit=plant.time_unit,
+        family_seed=selection.family_seed,
+        date=datetime.date.today().isoformat(),
+        machine=surroundings(),
+        policies=known,
+        rows=rows,
+        statistics=statistics.summarise(rows, known),
+        sweeps={
+            name: replace(sweep, best_baseline=statistics.best_baseline(sweep, known)) for name, sweep in swept.items()
+        },
+        stability=jobs.stabilities(done, label),
+        seconds=time.perf_counter() - begun,
+        command=command,
+        folder=str(selection.out),
+    )
+
+
+def write(selection: Selection, content: Comparison, done: Sequence[Done], progress: Progress) -> Path:
+    """comparison.json, comparison.csv, figures and the report; returns the report's path."""
+    values = msgspec.to_builtins(content, enc_hook=float)  # a user's settings may hold numbers of NumPy
+    write_json(selection.out / "comparison.json", values)
+    with (selection.out / "comparison.csv").open("w", newline="", encoding="utf-8") as file:
+        keys = (key for row in values["rows"] for key in row)
+        table = csv.DictWriter(file, list(dict.fromkeys([*COLUMNS, *keys])))
+        table.writeheader()
+        table.writerows(values["rows"])
+    figures: dict[str, Path] = {}
+    responses: dict[str, Path] = {}
+    lines = statistics.lines(content.rows, content.policies)
+    label = {(line.policy, line.run): line.label for line in lines}
+    overall = OVERALL + len(selection.sweeps)
+    progress.phase("drawing", overall + len(selection.scenarios))
+    with optional("figures"):
+        figures |= comparison_figures.draw(selection.out / "figures", content)
+        progress.advance(overall)
+        for name in selection.scenarios:
+            traces = {label[c.line]: t for c, t in jobs.first_episodes(done, name).items()}
+            traces = {line.label: traces[line.label] for line in lines}
+            path = selection.out / "figures" / f"{plants.slug(name)}.png"
+            scenario = scenarios.get(name, family_seed=selection.family_seed)
+            responses[name] = comparison_figures.responses(path, scenario, traces, [line.label for line in lines])
+            progress.advance()
+    return report.write(selection.out / REPORT, content, figures, responses)

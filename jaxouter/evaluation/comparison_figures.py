@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxouter.evaluation.comparison import Comparison, StabilityRow, SweepErrors
 from jaxouter.evaluation.drawing import Axes, Figure, Line2D, LogNorm, SubFigure
-from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, symbol, times
+from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, styled, symbol, times
 from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.results import Comparison, StabilityRow, SweepErrors
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario, reported
 from jaxouter.evaluation.statistics import Line, lines, on_grid, scenarios
@@ -120,7 +120,7 @@ def errors(path: Path, comparison: Comparison) -> Path:
     diverged = Line2D([], [], ls="", marker="$\\rightarrow$", color="#555555", ms=8, label="diverged")
     shown = {line.label: look[line.label] for line in every}
     _legend(figure, shown, lines_too=False, more=[*limit, hollow, diverged], columns=5)
-    return save(figure, path)
+    return save(styled(figure), path)
 
 
 def _dot(axes: Axes, line: Line, style: Style, scenario: str, key: str, height: float) -> None:
@@ -179,7 +179,7 @@ def effort(path: Path, comparison: Comparison) -> Path:
     figure.set_layout_engine("none")  # labels find their places in a layout that stays
     for axes, points in shown:
         _label(figure, axes, points, look)
-    return save(figure, path)
+    return save(styled(figure), path)
 
 
 def _mean_over(line: Line, names: Sequence[str], key: str) -> float | None:
@@ -248,7 +248,7 @@ def sweep(path: Path, comparison: Comparison, identifier: str) -> Path:
     """MAE over a swept parameter, relative to the policy's own nominal and to the best baseline there."""
     content = comparison.sweeps[identifier]
     draw = _curves if len(content.axes) == 1 else _maps
-    return save(draw(content, _styles(comparison)), path)
+    return save(styled(draw(content, _styles(comparison))), path)
 
 
 class _Ratios(NamedTuple):
@@ -424,7 +424,7 @@ def responses(path: Path, scenario: Scenario, traces: Mapping[str, Traces], name
     handles += [r, Line2D([], [], label="limits of y, bounds of r̃" if limits else "bounds of r̃", **red)]
     title = f"MAE of all episodes [{unit}]"
     figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title=title, title_fontsize=9)
-    return save(figure, path)
+    return save(styled(figure), path)
 
 
 def _range(scenario: Scenario, traces: Mapping[str, Traces]) -> tuple[float, float]:
@@ -469,7 +469,7 @@ def stability(path: Path, comparison: Comparison) -> Path:
             axes.set_ylabel("spectral radius")
     unstable = Line2D([], [], ls="", marker="o", mfc="white", mec=LIMIT, ms=6, mew=1.4, label="hollow red: unstable")
     _legend(figure, {policy: look[policy] for policy in policies}, more=[unstable], columns=6)
-    return save(figure, path)
+    return save(styled(figure), path)
 
 
 def _radii(axes: Axes, rows: Sequence[StabilityRow], style: Style) -> None:

@@ -7,6 +7,7 @@ Figures are written to files, which takes no backend; that of a notebook stays w
 from __future__ import annotations
 
 import atexit
+import io
 import os
 import shutil
 import sys
@@ -40,10 +41,22 @@ if "matplotlib" not in sys.modules:
         _fonts()
     _import()
 
+import matplotlib.figure
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-__all__ = ["Axes", "Figure", "Line2D", "LogLocator", "LogNorm", "NullFormatter", "SubFigure"]
+__all__ = ["DPI", "Axes", "Figure", "Line2D", "LogLocator", "LogNorm", "NullFormatter", "SubFigure"]
+
+DPI = 130
+
+
+class Figure(matplotlib.figure.Figure):
+    """A figure that a notebook shows without pyplot, which would keep it in memory."""
+
+    def _repr_png_(self) -> bytes:
+        png = io.BytesIO()
+        self.savefig(png, format="png", dpi=DPI)
+        return png.getvalue()

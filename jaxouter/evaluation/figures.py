@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxouter.evaluation.drawing import Axes, Figure, LogLocator, NullFormatter
+from jaxouter.evaluation.drawing import DPI, Axes, Figure, LogLocator, NullFormatter
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
@@ -22,13 +22,18 @@ HELD_OUT_ROWS = 600  # that are drawn
 LIVE_ROWS = 600  # the same, at either end
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write the PNG, in the style of all figures."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def styled(figure: Figure) -> Figure:
+    """The figure in the style of all figures."""
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.6)
-    figure.savefig(path, dpi=130)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write the figure, in the format that the path's suffix names; makes the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI)
     return path
 
 
@@ -129,7 +134,7 @@ def _finish(axes: Axes, scenario: Scenario, title: str = "", last: bool = True) 
     axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
 
 
-def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> Path:
+def response(scenario: Scenario, inner: Traces, learned: Traces) -> Figure:
     """r, y and r~ over time with the bounds: the inner loop alone beside the learned outer loop."""
     rates = scenario.plant.rate_limit is not None
     figure = Figure(figsize=(10, 8.4 if rates else 6), layout="constrained")
@@ -147,12 +152,10 @@ def response(path: Path, scenario: Scenario, inner: Traces, learned: Traces) -> 
     if rates:
         grid[2, 0].set_ylim(bottom=0)
     figure.suptitle(scenario.id, fontsize=11)
-    return save(figure, path)
+    return styled(figure)
 
 
-def paper(
-    path: Path, scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: Mapping[str, Traces]
-) -> Path:
+def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: Mapping[str, Traces]) -> Figure:
     """The paper's figure, (a) to (d), of a plant; of other plants (a) and (b) of the first scenario.
 
     Pitch: inner loop and learned loop, nominal and delayed. Heaters: inner loop and learned loop with 4 houses, the
@@ -189,16 +192,13 @@ def paper(
                     label="modified reference r̃",
                 )
         _finish(axes, scenario, title)
-    return save(figure, path)
+    return styled(figure)
 
 
-def learning_curve(
-    path: Path, rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapping[str, float], title: str
-) -> Path:
+def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapping[str, float], title: str) -> Figure:
     """MAE without exploration, and reward with it, over environment steps, a line a seed.
 
     Args:
-        path: PNG.
         rows: of metrics.jsonl, by seed; `mae` and `reward` are drawn.
         levels: horizontal lines by name, such as the MAE of the static prefilter.
         title: what the MAE is of.
@@ -218,10 +218,10 @@ def learning_curve(
     for axes in (left, right):
         axes.set_xlabel("environment steps [thousand]")
         axes.legend(fontsize=7.5, framealpha=0.85)
-    return save(figure, path)
+    return styled(figure)
 
 
-def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.ndarray) -> Path:
+def step_responses(plant: Plant, moves: np.ndarray, responses: np.ndarray) -> Figure:
     """What y does (n, T) after r~ has moved by so much (n,); and by that, where a linear plant has one line."""
     unit, time = symbol(plant.y_unit), plant.control_step * np.arange(responses.shape[1] + 1)
     figure = Figure(figsize=(7, 6), layout="constrained")
@@ -233,14 +233,13 @@ def step_responses(path: Path, plant: Plant, moves: np.ndarray, responses: np.nd
     above.set(ylabel=f"change of y, {unit}", title=f"{plant.name}: response to a move of r̃ at 0")
     below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
     above.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return save(figure, path)
+    return styled(figure)
 
 
-def live(path: Path, steps: Mapping[str, np.ndarray], unit: str = "1") -> Path:
+def live(steps: Mapping[str, np.ndarray], unit: str = "1") -> Figure:
     """The beginning and the end of a live run: r, y and what y would have been, and r~.
 
     Args:
-        path: PNG.
         steps: time (s), r, y, r_tilde and y_passed, (T,) each; nan where there is none.
         unit: of y.
     """
@@ -262,14 +261,13 @@ def live(path: Path, steps: Mapping[str, np.ndarray], unit: str = "1") -> Path:
     grid[1, 0].set_ylabel(f"r̃{told}")
     for axes in grid[:, 0]:
         axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
-    return save(figure, path)
+    return styled(figure)
 
 
-def log_report(path: Path, report: Validation, title: str, y_unit: str = "1", time_unit: str = "s") -> Path:
+def log_report(report: Validation, title: str, y_unit: str = "1", time_unit: str = "s") -> Figure:
     """What a log tells: the held-out free run, the step responses, and the levels and frequencies of its r~.
 
     Args:
-        path: PNG.
         report: of the log.
         title: of the whole, such as the name of the log.
         y_unit, time_unit: of the log.
@@ -282,7 +280,7 @@ def log_report(path: Path, report: Validation, title: str, y_unit: str = "1", ti
     _levels(figure.add_subplot(grid[1, 1]), report, unit)
     _frequencies(figure.add_subplot(grid[1, 2]), report, time_unit)
     figure.suptitle(title, fontsize=11)
-    return save(figure, path)
+    return styled(figure)
 
 
 def _held_out(axes: Axes, report: Validation, unit: str, time_unit: str) -> None:

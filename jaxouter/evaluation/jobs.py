@@ -12,7 +12,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -27,19 +28,20 @@ import msgspec
 import numpy as np
 from msgspec.structs import asdict
 
+from jaxouter import terminal
 from jaxouter.evaluation import cache, scenarios, stability, sweeps
 from jaxouter.evaluation.baselines import CLAIRVOYANT, NAMES, OWN, Baseline, Kind, identified, resolve
 from jaxouter.evaluation.baselines.clairvoyant import Replay, plan
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.comparison import GridErrors, PolicyInfo, Row, StabilityRow, SweepErrors
 from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit
+from jaxouter.evaluation.results import GridErrors, PolicyInfo, Row, StabilityRow, SweepErrors
 from jaxouter.evaluation.rollout import Traces, rollout
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import Plant, make
 from jaxouter.plants.errors import PlantError
-from jaxouter.plants.registry import attribute, own_errors
-from jaxouter.training.run import RunFolder
+from jaxouter.plants.registry import REGISTRATIONS, Registration, add, attribute, own_errors
+from jaxouter.training.run import RunFolder, add_agent
 
 TUNED = ("baseline", "limit")  # kinds of policies that are identified first
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
@@ -106,12 +108,17 @@ def entrant(name: str, plant: Plant) -> Entrant:
     if colon and file.endswith(".py"):
         if isinstance(attribute(Path(file), attribute_name, OWN), Baseline):
             return Entrant(name, resolve(name).kind)
-        return Entrant(f"{Path(file).name}:{attribute_name}", "user", file, None, attribute_name)
+        return Entrant(short(name), "user", file, None, attribute_name)
     if name not in NAMES:
         raise ValueError(f"there is no policy {name!r}; it may be FILE.py:CLASS or one of: {', '.join(NAMES)}")
     if name not in possible(plant):
         raise ValueError(f"there is no {name} for {plant.name}, which is not declared {NEEDS[name]}")
     return Entrant(name, "preview" if name == CLAIRVOYANT else resolve(name).kind)
+
+
+def short(name: str) -> str:
+    """A policy's name in results: of FILE.py:CLASS without the folder."""
+    return Path(name).name if is_own(name) else name
 
 
 def is_own(name: str | None) -> bool:
@@ -297,6 +304,7 @@ def spread(
     """
     cores = os.cpu_count() or 1
     alone = cores == 1 or len(work) == 1 or multiprocessing.current_process().daemon  # which may have no children
+    alone |= any(each.session for each in REGISTRATIONS.values())
     if jax.default_backend() != "cpu" or alone:
         for job in work:
             yield run(job, partial(report, job))
@@ -329,6 +337,19 @@ def spread(
             for process in multiprocessing.active_children():
                 process.terminate()
             raise
+
+
+def prepare(registered: Iterable[Registration], agents: Iterable[str]) -> None:
+    """Set up a child process: the plants and agents that its parent has registered, and the compilation cache."""
+    terminal.last()
+    for plant in registered:
+        add(plant.reference, plant.options)
+    for agent in agents:
+        add_agent(agent)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the parent has already warned about the cache
+        cache.use_compilation_cache()
+    warnings.showwarning = terminal.show
 
 
 def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, PolicyInfo]:

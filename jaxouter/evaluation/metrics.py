@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
+import jax
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType, field
 
 from jaxouter.evaluation.rollout import Traces, excess
 from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.loop import rewards
+from jaxouter.loop.rewards import RewardConfig, RewardParams
 from jaxouter.plants import Plant
+from jaxouter.plants.base import RUN_ONCE
 
 BAND = 0.05  # of the step, for the settling time
 ROUNDING = 1e-4  # of the error scale, by which a limit that is just met may be exceeded
@@ -41,6 +46,11 @@ class FiguresOfMerit(Struct, frozen=True, kw_only=True):
     diverged: bool | UnsetType = UNSET  # only where a trace is not finite
 
 
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for a table, with so many significant digits; a dash for None."""
+    return "-" if value is None else significant(value, digits)
+
+
 def significant(value: float, digits: int) -> str:
     """A figure of merit for people, with so many significant digits and all digits before the point up to a million."""
     if 10**digits - 0.5 <= abs(value) < 1e6:
@@ -51,6 +61,37 @@ def significant(value: float, digits: int) -> str:
 def mae(traces: Traces) -> float:
     """Mean of |r_k - y_(k+1)| over steps and episodes, the paper's measure."""
     return float(np.mean(np.abs(traces.r - traces.y)))
+
+
+def trained_return(traces: Traces, plant: Plant, config: RewardConfig) -> float | None:
+    """Sum of the rewards that are trained on in an episode, mean over episodes; None where not finite."""
+    found = np.asarray(_rewards(plant, rewards.params(plant, config), *_moves(traces, plant)))
+    total = float(found.sum(1).mean())
+    return total if np.isfinite(total) else None
+
+
+def reward_terms(traces: Traces, plant: Plant) -> dict[str, float]:
+    """Mean per step of each reward term that the plant declares, as `reward_NAME`."""
+    signals = _moves(traces, plant)
+    return {f"reward_{term.__name__}": float(np.mean(_over_episodes(term)(*signals))) for term in plant.reward_terms}
+
+
+def _moves(traces: Traces, plant: Plant) -> tuple[np.ndarray, ...]:
+    """r, y, y before, r~ and r~ before of each control step, (episodes, T) each."""
+    first = np.clip(traces.y0, *plant.r_tilde_bounds)
+    before = (np.concatenate([a[:, None], b[:, :-1]], 1) for a, b in ((traces.y0, traces.y), (first, traces.r_tilde)))
+    y_before, r_tilde_before = before
+    return traces.r, traces.y, y_before, traces.r_tilde, r_tilde_before
+
+
+def _over_episodes(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    return jax.vmap(jax.vmap(function))
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
+def _rewards(plant: Plant, price: RewardParams, *signals: jax.Array) -> jax.Array:
+    """Rewards (episodes, T) that are trained on."""
+    return _over_episodes(partial(rewards.reward, price, terms=plant.reward_terms))(*signals)
 
 
 def held(traces: Traces, plant: Plant) -> float:

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from jaxouter.evaluation.comparison import Comparison, LineSummary, StabilityRow, Summary
 from jaxouter.evaluation.figures import symbol
 from jaxouter.evaluation.metrics import significant
+from jaxouter.evaluation.results import Comparison, LineSummary, StabilityRow, Summary
 from jaxouter.evaluation.statistics import Line, lines, scenarios
 
 KIND_NAMES = {

@@ -14,7 +14,7 @@ from jaxouter import tasks
 from jaxouter.loop import sensor as sensors
 from jaxouter.loop.references import FAMILIES
 from jaxouter.loop.sensor import SensorParams
-from jaxouter.plants import Plant, Ranges, make
+from jaxouter.plants import Plant, Ranges, base, make, parameters
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
@@ -70,7 +70,7 @@ def _declared(plant: str, name: str, spec: tasks.Scenario) -> Builder:
             changed = (made.episode_steps // 2, spec.adapt(_repeat(after, n)))
         r = jnp.repeat(jnp.asarray(spec.reference, float), made.episode_steps // len(spec.reference))
         r = jnp.pad(r, (0, made.episode_steps - r.size), mode="edge")
-        scenario = _scenario(name, made, params, r, n, change=changed, paper=spec.paper)
+        scenario = _scenario(name, made, params, r, n, change=changed, paper=None if parameters(plant) else spec.paper)
         return replace(
             scenario,
             params=spec.adapt(scenario.params),
@@ -120,6 +120,36 @@ def builder(identifier: str, family_seed: int = FAMILY_SEED) -> Builder:
     return scenarios[identifier]
 
 
+def identifiers(plant: str, names: Sequence[str] = ()) -> list[str]:
+    """Ids of scenarios of a plant.
+
+    Args:
+        plant: its name.
+        names: ids, with or without the plant; parameters that the plant's name sets may be left out. Empty: all.
+
+    Raises:
+        ValueError: there is no such scenario, or it is another plant's.
+    """
+    found = of_plant(plant, names) or list(catalogue(plant))
+    for name in found:
+        builder(name)
+    return found
+
+
+def of_plant(plant: str, names: Sequence[str]) -> list[str]:
+    """Ids with the plant's name, which may lack in `names`, or lack the parameters that it sets.
+
+    Raises:
+        ValueError: an id is another plant's.
+    """
+    parts = [name.rpartition("/") for name in names]
+    for of, _, name in parts:
+        if of not in ("", plant, base(plant)):
+            make(of)
+            raise ValueError(f"the plant is {plant}; {of}/{name} is another plant's")
+    return list(dict.fromkeys(f"{plant}/{name}" for _, _, name in parts))
+
+
 def get(identifier: str, episodes: int | None = None, family_seed: int = FAMILY_SEED) -> Scenario:
     """The scenario called `identifier`, with so many episodes (None: its own number).
 
@@ -140,11 +170,12 @@ def perturbed(identifier: str, steps: int = 600, episodes: int = 64) -> Scenario
     )
 
 
-def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
+def place(scenario: Scenario, trained: str, ranges: Ranges, noise: float) -> Place:
     """Where a scenario lies among the plants of a training under domain randomisation.
 
     Args:
         scenario: whose plant, whatever its references.
+        trained: name of the plant of the training.
         ranges: numbers of the plant that training drew; the others were the nominal ones.
         noise: largest standard deviation of the measurement noise in training.
 
@@ -153,7 +184,7 @@ def place(scenario: Scenario, ranges: Ranges, noise: float) -> Place:
         or greatest value, else 'inside'. How many houses there are and where they start counts for nothing.
     """
     start = tasks.of(scenario.plant.name).start
-    nominal = _numbers(make(scenario.plant.name)[1], start)
+    nominal = _numbers(make(trained)[1], start)
     bounds = {name: (leaf.copy(), leaf.copy()) for name, leaf in nominal.items()}
     for name, *ends in ranges:
         field, _, element = name.partition("[")

@@ -12,7 +12,7 @@ import scipy.stats
 from msgspec.structs import replace
 
 from jaxouter.evaluation.baselines import Kind
-from jaxouter.evaluation.comparison import (
+from jaxouter.evaluation.results import (
     BestBaseline,
     GridErrors,
     Improvement,

@@ -5,13 +5,13 @@ A sweep is a scenario whose episodes are the points of a grid, row-major over it
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxouter import tasks
+from jaxouter import plants, tasks
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
@@ -43,7 +43,8 @@ def _declared(plant: str, name: str, spec: tasks.Sweep) -> Builder:
     identifier = f"{plant}/{name}"
 
     def build(coarse: bool) -> Sweep:
-        chosen = tuple(_thinned(axis, spec.stride) if coarse else axis for axis in spec.axes)
+        axes = [_around(axis, plants.parameters(plant).get(axis.name)) for axis in spec.axes]
+        chosen = tuple(_thinned(axis, spec.stride) if coarse else axis for axis in axes)
         grids = np.meshgrid(*(axis.values for axis in chosen), indexing="ij")
         values = [jnp.asarray(np.repeat(grid.ravel(), spec.repeats), float) for grid in grids]
         base = scenarios.get(f"{plant}/{spec.scenario}", len(values[0]))
@@ -56,6 +57,11 @@ def _declared(plant: str, name: str, spec: tasks.Sweep) -> Builder:
         return Sweep(identifier, chosen, replace(varied, id=identifier, keys=keys, paper=None), spec.repeats)
 
     return build
+
+
+def _around(axis: Axis, value: float | None) -> Axis:
+    """The axis with this nominal value, if any; it is added to the values."""
+    return axis if value is None else replace(axis, nominal=value, values=tuple(sorted({*axis.values, value})))
 
 
 def _thinned(axis: Axis, stride: int) -> Axis:
@@ -83,6 +89,18 @@ def builder(identifier: str) -> Builder:
     if identifier not in sweeps:
         raise ValueError(f"there is no sweep {identifier!r}; {name} has: {', '.join(sweeps) or 'none'}")
     return sweeps[identifier]
+
+
+def identifiers(plant: str, names: Sequence[str]) -> list[str]:
+    """Ids of sweeps of a plant, from ids as for `scenarios.identifiers`.
+
+    Raises:
+        ValueError: there is no such sweep, or it is another plant's.
+    """
+    found = scenarios.of_plant(plant, names)
+    for name in found:
+        builder(name)
+    return found
 
 
 def get(identifier: str, coarse: bool = False) -> Sweep:

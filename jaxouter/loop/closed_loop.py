@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from jaxouter.loop import rewards
 from jaxouter.loop.policy import Policy
-from jaxouter.loop.rewards import RewardParams
+from jaxouter.loop.rewards import RewardParams, Term
 from jaxouter.plants import Plant
 
 Measure = Callable[[jax.Array, jax.Array], jax.Array]
@@ -62,6 +62,7 @@ def advance(
     measure: Measure = exactly,
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
+    terms: tuple[Term, ...] = (),
 ) -> tuple[LoopState, jax.Array, Any]:
     """One control step under r~ (scalar), clipped to its bounds.
 
@@ -73,6 +74,7 @@ def advance(
         key: randomness of the plant.
         measure, treat: see `Measure` and `Treat`.
         load: disturbance that is added to r~ at the plant; neither reward nor observation sees it.
+        terms: of the reward, beside the paper's.
 
     Returns:
         The state at t_(k+1), the reward on the true outputs, and the result of `treat`.
@@ -80,7 +82,7 @@ def advance(
     r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
     plant_state = plant.step(params, state.plant, r_tilde + load, key)
     y, found = treat(r_tilde, plant.output(params, plant_state))
-    reward = rewards.reward(price, r, y, state.y, r_tilde, state.r_tilde)
+    reward = rewards.reward(price, r, y, state.y, r_tilde, state.r_tilde, terms)
     return LoopState(plant_state, y, measure(y, state.y_seen), r_tilde), reward, found
 
 
@@ -98,6 +100,7 @@ def step(
     measure: Measure = exactly,
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
+    terms: tuple[Term, ...] = (),
 ) -> tuple[LoopState, Any, jax.Array, Any]:
     """One control step under a JAX policy with its memory (carry); otherwise like `advance`.
 
@@ -105,5 +108,5 @@ def step(
         The state at t_(k+1), the memory, the reward, and the result of `treat`.
     """
     memory, r_tilde = policy.act(policy_params, memory, r, state.y_seen, key_policy)
-    state, reward, found = advance(plant, params, price, state, r, r_tilde, key, measure, treat, load)
+    state, reward, found = advance(plant, params, price, state, r, r_tilde, key, measure, treat, load, terms)
     return state, memory, reward, found

@@ -24,7 +24,7 @@ from jaxouter.loop import closed_loop, rewards, sensor
 from jaxouter.loop.closed_loop import LoopState
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
-from jaxouter.loop.rewards import RewardParams
+from jaxouter.loop.rewards import RewardConfig, RewardParams
 from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant, Ranges, randomised
 from jaxouter.plants import make as make_plant
@@ -107,7 +107,7 @@ class Environment:
         loop = LoopState(state.plant, state.y, state.y_seen, before)
         measure = partial(sensor.measure, params.sensor, key)
         loop, reward, terminated = closed_loop.advance(
-            plant, p, params.reward, loop, state.r, action, key, measure, self._bounded
+            plant, p, params.reward, loop, state.r, action, key, measure, self._bounded, terms=plant.reward_terms
         )
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
         truncated = state.k + 1 >= plant.episode_steps
@@ -172,6 +172,7 @@ def make(
     integral_steps: float | None = None,
     goal: Goal | None = None,
     drawn: Ranges = (),
+    reward: RewardConfig = rewards.PAPER,
     **overrides: Any,
 ) -> tuple[Environment, EnvParams]:
     """An environment on the training distribution, and its parameters.
@@ -181,6 +182,7 @@ def make(
         history, integral_steps: of the observation, see `Observer.of`.
         goal: reference generator; None: one set-point per episode, as in the paper.
         drawn: parameters to draw at each reset, see `jaxouter.plants.randomised`.
+        reward: weights of the reward.
         **overrides: parameters of the plant.
     """
     plant, plant_params = make_plant(name, **overrides)
@@ -188,4 +190,4 @@ def make(
         plant, plant_params = randomised(plant, plant_params, drawn)
     goal = SetPoint(*plant.setpoint_range) if goal is None else goal
     env = Environment(plant, Observer.of(plant, history, integral_steps), goal)
-    return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant))
+    return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant, reward))

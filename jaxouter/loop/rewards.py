@@ -1,12 +1,59 @@
-"""The reward R = G(e) + H(r~) + B(y), composed of scalar functions (paper eq. 1)."""
+"""The reward R = G(e) + H(r~) + B(y), composed of scalar functions (paper eq. 1).
+
+What is trained on may have other weights, and terms that the plant declares (`RewardConfig`, `Plant.reward_terms`).
+What is reported as `return` is always the paper's.
+"""
 
 from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from jaxouter.plants import Plant
+
+Term = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
+"""`term(r, y, y_before, r_tilde, r_tilde_before) -> reward`, scalars; arguments as for `reward`."""
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward R = G + H + B that is trained on; its negative is the cost of the pretraining.
+
+    The defaults are the paper's. The reported return always has the paper's weights.
+    """
+
+    alpha_g: float = 0.3
+    """G: price of the error |r - y|."""
+    beta_h: float = 0.1
+    """H: price of a move of r~."""
+    rho_h: float | None = None
+    """H: smallest move of r~ that is charged, in the unit of y; None: the plant's."""
+    beta_b: float = 0.1
+    """B: price of a move of y."""
+    rho_b: float | None = None
+    """B: smallest move of y that is charged, in the unit of y; None: the plant's."""
+    delta_b: float = 1.0
+    """B: price of leaving the limits on y and on its rate."""
+    divergence: float = -50.0
+    """Reward at the end of an episode that diverged, in error scales of the plant."""
+    terms: float = 1.0
+    """Weight of the terms that the plant declares."""
+
+    def check(self) -> None:
+        """Raises ValueError if a weight is wrong; names the field, its value and what is allowed."""
+        for name, value in dataclasses.asdict(self).items():
+            if name == "divergence" and value > 0:
+                raise ValueError(f"reward.{name} is {value}; it must not be positive")
+            if name != "divergence" and value is not None and value < 0:
+                raise ValueError(f"reward.{name} is {value}; it must not be negative")
+
+
+PAPER = RewardConfig()
 
 
 @struct.dataclass
@@ -22,24 +69,26 @@ class RewardParams:
     output_limit: jax.Array  # on |y|
     rate_limit: jax.Array  # on a move of y
     divergence: jax.Array  # added when an episode ends by divergence
+    terms: jax.Array  # weight of the plant's own terms
 
 
-def params(plant: Plant, divergence: float = -50.0) -> RewardParams:
-    """The paper's constants, with the plant's declared thresholds and limits; `divergence` in error scales."""
+def params(plant: Plant, config: RewardConfig = PAPER) -> RewardParams:
+    """The configured constants, with the plant's declared thresholds and limits."""
 
     def declared(value: float | None) -> jax.Array:
         return jnp.asarray(jnp.inf if value is None else value, float)
 
     return RewardParams(
-        alpha_g=declared(0.3),
-        beta_h=declared(0.1),
-        rho_h=declared(plant.move_threshold),
-        beta_b=declared(0.1),
-        rho_b=declared(plant.move_threshold),
-        delta_b=declared(1.0),
+        alpha_g=declared(config.alpha_g),
+        beta_h=declared(config.beta_h),
+        rho_h=declared(plant.move_threshold if config.rho_h is None else config.rho_h),
+        beta_b=declared(config.beta_b),
+        rho_b=declared(plant.move_threshold if config.rho_b is None else config.rho_b),
+        delta_b=declared(config.delta_b),
         output_limit=declared(plant.output_limit),
         rate_limit=declared(plant.rate_limit),
-        divergence=declared(divergence * plant.error_scale),
+        divergence=declared(config.divergence * plant.error_scale),
+        terms=declared(config.terms),
     )
 
 
@@ -59,7 +108,13 @@ def excess(value: jax.Array, limit: jax.Array, delta: jax.Array) -> jax.Array:
 
 
 def reward(
-    p: RewardParams, r: jax.Array, y: jax.Array, y_before: jax.Array, r_tilde: jax.Array, r_tilde_before: jax.Array
+    p: RewardParams,
+    r: jax.Array,
+    y: jax.Array,
+    y_before: jax.Array,
+    r_tilde: jax.Array,
+    r_tilde_before: jax.Array,
+    terms: tuple[Term, ...] = (),
 ) -> jax.Array:
     """R of one control step, scalar.
 
@@ -68,14 +123,17 @@ def reward(
         r: reference at t_k.
         y, y_before: outputs at t_(k+1) and t_k.
         r_tilde, r_tilde_before: modified references at t_k and t_(k-1).
+        terms: functions to add, of the same signals.
 
     Source: paper eq. 1 and 7, B of sections III and IV.
     """
     delta_y = jnp.abs(y - y_before)
-    return (
+    of_paper = (
         tracking(jnp.abs(r - y), p.alpha_g)
         + moves(jnp.abs(r_tilde - r_tilde_before), p.beta_h, p.rho_h)
         + moves(delta_y, p.beta_b, p.rho_b)
         + excess(jnp.abs(y), p.output_limit, p.delta_b)
         + excess(delta_y, p.rate_limit, p.delta_b)
     )
+    own = [p.terms * term(r, y, y_before, r_tilde, r_tilde_before) for term in terms]
+    return sum(own, of_paper)

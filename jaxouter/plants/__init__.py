@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, partial, wraps
 from typing import Any
 
 import chex
 import jax
+import numpy as np
 
-from jaxouter.plants import heaters, pitch, versions
+from jaxouter.plants import declaration, heaters, pitch, versions
 from jaxouter.plants.base import Plant, outputs
+from jaxouter.plants.errors import Raised, said
 
-__all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate"]
+__all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simulate", "with_parameters"]
 
 Ranges = tuple[tuple[str, float, float], ...]
 """(name, low, high) of each parameter that is drawn."""
@@ -30,9 +34,97 @@ def resolve(name: str) -> Callable[..., tuple[Plant, Any]]:
     Raises:
         ValueError: there is no such plant; lists the plants.
     """
-    if name not in REGISTRY:
+    if base(name) not in REGISTRY:
         raise ValueError(f"there is no plant {name!r}; the plants are: {', '.join(REGISTRY)}")
-    return REGISTRY[name]
+    return REGISTRY[name] if name in REGISTRY else _derived(name)
+
+
+def base(name: str) -> str:
+    """The registered name in a plant's name: that of `pitch(tau=0.7)` is `pitch`."""
+    return name.partition("(")[0]
+
+
+def parameters(name: str) -> dict[str, Any]:
+    """The parameters that a plant's name sets: those of `pitch(tau=0.7)` are `{"tau": 0.7}`.
+
+    Raises:
+        ValueError: they can't be read.
+    """
+    _, opened, inner = name.partition("(")
+    if not opened:
+        return {}
+    try:
+        call = ast.parse(f"plant({inner}", mode="eval").body
+        if not isinstance(call, ast.Call) or call.args or any(each.arg is None for each in call.keywords):
+            raise ValueError(name)
+        return {str(each.arg): ast.literal_eval(each.value) for each in call.keywords}
+    except (ValueError, SyntaxError):
+        raise ValueError(f"{name!r} is not a plant's name with parameters, such as pitch(tau=0.7)") from None
+
+
+def with_parameters(name: str, settings: Mapping[str, Any]) -> str:
+    """The name of a plant with parameters set, by which it is made like any other.
+
+    For example: `with_parameters("pitch", {"tau": 0.7})` is `"pitch(tau=0.7)"`. Scenarios and sweeps that give a
+    parameter another value keep that.
+
+    Args:
+        name: a plant's name; those parameters that it sets already are kept.
+        settings: numbers, or nested lists or arrays of numbers, by the name that the plant's maker has for them.
+
+    Raises:
+        ValueError: unknown plant or parameter (lists the known ones), or a wrong value.
+    """
+    if not settings:
+        return name
+    values = parameters(name) | {key: _literal(key, value) for key, value in settings.items()}
+    known = list(inspect.signature(resolve(name)).parameters)
+    ordered = {key: values[key] for key in (*known, *values) if key in values}
+    named = f"{base(name)}({', '.join(f'{key}={value!r}' for key, value in ordered.items())})"
+    try:
+        make(base(name), **ordered)
+    except ValueError:
+        raise
+    except Raised as error:
+        raise ValueError(f"{named} can't be made: {said(error)}") from error
+    return named
+
+
+def slug(name: str) -> str:
+    """A plant's name as part of a file's name: that of `pitch(tau=0.7)` is `pitch-tau-0.7`."""
+    return re.sub(r"[^\w.+-]+", "-", name).rstrip("-")
+
+
+def _literal(name: str, value: Any) -> Any:
+    """A parameter's value as plain Python numbers and tuples."""
+
+    def of(value: Any) -> Any:
+        return tuple(map(of, np.asarray(value))) if getattr(value, "ndim", 0) else declaration.plain(value)
+
+    plain = of(value)
+    try:
+        if ast.literal_eval(repr(plain)) == plain:
+            return plain
+    except (ValueError, SyntaxError):
+        pass
+    raise ValueError(f"{name} is {value!r}; it must be a finite number, or a list or array of finite numbers")
+
+
+@cache
+def _derived(name: str) -> Callable[..., tuple[Plant, Any]]:
+    """The maker of a plant whose name sets parameters."""
+    maker, values = REGISTRY[base(name)], parameters(name)
+
+    @cache
+    def renamed(plant: Plant) -> Plant:  # cached, so that it is compiled once
+        return replace(plant, name=name)
+
+    @wraps(maker)
+    def made(**overrides: Any) -> tuple[Plant, Any]:
+        plant, params = maker(**values | overrides)
+        return renamed(plant), params
+
+    return made
 
 
 def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
@@ -41,7 +133,7 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
     For example: `plant, params = make("pitch", tau=0.5, d1=0.57)`.
 
     Args:
-        name: `pitch`, `heaters` or another key of `REGISTRY`.
+        name: `pitch`, `heaters` or another key of `REGISTRY`; or one with parameters, such as `pitch(tau=0.7)`.
         **overrides: keyword arguments of the plant's own `make`, such as `jaxouter.plants.pitch.make`.
 
     Raises:
@@ -51,7 +143,8 @@ def make(name: str, **overrides: Any) -> tuple[Plant, Any]:
     known = list(inspect.signature(maker).parameters)
     unknown = [key for key in overrides if key not in known]
     if unknown:
-        raise ValueError(f"plant {name!r} has no parameter {', '.join(unknown)}; it has: {', '.join(known)}")
+        there = f"it has: {', '.join(known)}" if known else "its maker takes none"
+        raise ValueError(f"plant {name!r} has no parameter {', '.join(unknown)}; {there}")
     return maker(**overrides)
 
 

@@ -94,6 +94,9 @@ class Plant:
     reuse: Callable[[Any, Any], Any] = lambda old, fresh: fresh
     """`reuse(old, fresh) -> state`: the fresh state, but with those arrays of the old one that need not be cleared at a
     reset (delay lines). It saves a copy."""
+    reward_terms: tuple[Callable[..., jax.Array], ...] = ()
+    """Functions `term(r, y, y_before, r_tilde, r_tilde_before) -> reward` of scalars, added to the reward that is
+    trained on; see `jaxouter.loop.rewards.reward`. Metrics name each by its function's name."""
     members: Callable[[Any, Any], jax.Array] | None = None
     """`members(params, state) -> (n,)`: the individual outputs of which y is a weighted mean; None: there are none."""
 
@@ -180,8 +183,11 @@ def array(name: str, value: Any, *shapes: tuple[int, ...]) -> jax.Array:
     Raises:
         ValueError: names the field, the shape got and the shapes allowed.
     """
-    out = jnp.asarray(value, dtype=float)
+    allowed = " or ".join("a number" if not s else f"an array of shape {s}" for s in shapes)
+    try:
+        out = jnp.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {value!r}; it must be {allowed}") from None
     if out.shape not in shapes:
-        allowed = " or ".join("a number" if not s else f"an array of shape {s}" for s in shapes)
         raise ValueError(f"{name} has shape {out.shape}; it must be {allowed}")
     return out

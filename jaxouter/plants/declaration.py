@@ -98,6 +98,14 @@ def _families(value: Any) -> tuple[str, ...]:
     return found
 
 
+def _terms(value: Any) -> tuple[Any, ...]:
+    found = (value,) if callable(value) else tuple(value)
+    names = [getattr(each, "__name__", "") for each in found]
+    if not all(map(callable, found)) or not all(map(str.isidentifier, names)) or len(set(names)) < len(names):
+        raise ValueError(value)
+    return found
+
+
 def _or_none(kind: Kind) -> Kind:
     """The same kind, or None."""
     return Kind(f"{kind.allowed}, or None", lambda value: None if value is None else kind.of(value), kind.function)
@@ -137,6 +145,7 @@ PLANT: Mapping[str, Kind] = {
     "draw": _or_none(FUNCTION),
     "identified": FLAG,
     "reuse": FUNCTION,
+    "reward_terms": Kind("a tuple of functions with different names", _terms),
     "members": _or_none(FUNCTION),
     "variables": FUNCTION,
     "settled": FUNCTION,

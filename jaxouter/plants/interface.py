@@ -50,6 +50,13 @@ def shapes(plant: Plant, params: Any) -> None:
     variables = _traced("variables(params, state)", plant.variables, params, state)
     settled = _traced("settled(params, state, variables)", plant.settled, params, state, variables)
     _same("settled(params, state, variables)", "state", state, settled)
+    for term in plant.reward_terms:
+        signature = f"{term.__name__}(r, y, y_before, r_tilde, r_tilde_before)"
+        found = _traced(signature, term, *[r_tilde] * 5)
+        if not isinstance(found, jax.ShapeDtypeStruct) or (found.shape, found.dtype) != (float_.shape, float_.dtype):
+            raise ValueError(
+                f"{signature} gave {_of(found)}; a reward must be one number of shape (), {float_.dtype}[]"
+            )
     if plant.members is not None:
         each = _of(_traced("members(params, state)", plant.members, params, state))
         if not re.fullmatch(rf"{float_.dtype}\[\d+\]", each):

@@ -16,7 +16,8 @@ import inspect
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator
+import uuid
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, wraps
@@ -41,14 +42,21 @@ KINDS: dict[str, Callable[[str, str, PlantOptions], tuple[Plant, Any]]] = {
 FORMS = "FILE.py:NAME, gym:ID, fmu:FILE, log:FILE"
 
 
+Maker = Callable[..., tuple[Plant, Any]]
+"""A function, or a `jaxouter.tasks.Task`, that gives a plant and its parameters."""
+
+
 class Registration(NamedTuple):
     """Where a plant comes from."""
 
     reference: str
     options: PlantOptions
-    sha256: str  # of the plant's file
+    sha256: str  # of the plant's file, or of its function's source
+    session: str = ""  # not empty if the plant is an object of this process, which no other one can import
 
 
+SETTING = re.compile(r"(.*?)(\(\w+=.*\))")
+"""A plant's reference and the parameters that it sets."""
 REGISTRATIONS: dict[str, Registration] = {}
 """All added plants, by short name."""
 
@@ -77,14 +85,61 @@ def attribute(path: Path, name: str, what: str) -> Any:
     return getattr(module, name)
 
 
-def add(reference: str, options: PlantOptions = PlantOptions()) -> str:  # noqa: B008 - frozen
-    """Register the plant that a command line names; returns the short name by which `plants.make` finds it.
+def add(
+    reference: str | Maker,
+    options: PlantOptions = PlantOptions(),  # noqa: B008 - frozen
+    parameters: Mapping[str, Any] | None = None,
+) -> str:
+    """Register a plant; returns the name by which `plants.make` finds it.
+
+    Args:
+        reference: a registered name, FILE.py:NAME and the like; parameters may follow, as in `pitch(tau=0.7)`. Or the
+            plant's maker or task itself, which takes the place of one of the same name.
+        options: what a plant of another simulator does not declare itself.
+        parameters: of the plant, set in addition.
 
     Raises:
-        ValueError: there is no such plant, it does not implement the interface, or its short name is taken.
+        ValueError: there is no such plant or parameter, it does not implement the interface, or its short name is
+            taken.
     """
-    if reference in plants.REGISTRY and reference not in REGISTRATIONS:
-        _plain(reference, options)
+    if not isinstance(reference, str):
+        return plants.with_parameters(_add_object(reference), parameters or {})
+    found = SETTING.fullmatch(reference)
+    plant, inner = found.groups() if found else (reference, "")
+    named = _add(plant, options)
+    settings = plants.parameters(named + inner) | dict(parameters or {})
+    return plants.with_parameters(named, settings)
+
+
+def _add_object(maker: Maker) -> str:
+    """Register a maker or a task of this process; returns its short name."""
+    try:
+        name = getattr(maker, "__name__", None) or maker()[0].name
+        made = maker()
+        plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
+        interface.shapes(plant, params)
+    except ValueError as error:
+        raise ValueError(f"the plant {maker!r}: {error}") from error
+    except Raised as error:
+        raise ValueError(f"the plant {maker!r} can't be made: {said(error)}") from error
+    if name in plants.REGISTRY and name not in REGISTRATIONS:
+        raise ValueError(f"the plant {maker!r} has the name {name!r} of a built-in plant; rename it")
+    try:
+        source = inspect.getsource(getattr(maker, "make", maker))
+    except (OSError, TypeError):  # typed in, or no function
+        source = repr(maker)
+    digest = hashlib.sha256(source.encode()).hexdigest()
+    plants.REGISTRY[name] = _named(name, maker)
+    plants._derived.cache_clear()  # of the one before
+    REGISTRATIONS[name] = Registration(f"a Python object {name}", PlantOptions(), digest, uuid.uuid4().hex)
+    return name
+
+
+def _add(reference: str, options: PlantOptions) -> str:
+    """Register a plant without parameters; returns its short name."""
+    if reference in plants.REGISTRY:
+        if reference not in REGISTRATIONS or options != REGISTRATIONS[reference].options:
+            _plain(reference, options)
         return reference
     name, make, path = _find(reference, options)
     source = Registration(reference, options, hashlib.sha256(path.read_bytes()).hexdigest())
@@ -169,9 +224,7 @@ def _guarded(plant: Plant) -> Plant:
     if plant.variables is float_leaves:
         own = [name for name in own if name not in ("variables", "settled")]
 
-    def guarded(name: str) -> Callable[..., Any]:
-        function = getattr(plant, name)
-
+    def guarded(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def call(*args: Any) -> Any:
             try:
@@ -183,7 +236,8 @@ def _guarded(plant: Plant) -> Plant:
 
         return call
 
-    return replace(plant, **{name: guarded(name) for name in own})
+    terms = tuple(guarded(term.__name__, term) for term in plant.reward_terms)
+    return replace(plant, reward_terms=terms, **{name: guarded(name, getattr(plant, name)) for name in own})
 
 
 class _Kept(logging.Filter):
@@ -207,6 +261,7 @@ def own_errors() -> Iterator[None]:
 
     Raises:
         PlantError: the plant's code failed.
+        ValueError: JAX is told to use a platform that it does not find.
         KeyboardInterrupt: Ctrl-C in the plant's code.
     """
     kept, loggers = _Kept(), [logging.getLogger(name) for name in CALLBACKS]
@@ -214,9 +269,11 @@ def own_errors() -> Iterator[None]:
         logger.filters.insert(0, kept)  # before the filter of an enclosing block
     try:
         yield
-    except (jax.errors.JaxRuntimeError, ValueError) as error:  # JAX raises either
-        last = kept.last
-        if isinstance(error, PlantError) or "callback" not in str(error):
+    except Exception as error:
+        if (message := missing_platform()) is not None:
+            raise ValueError(message) from error
+        last, of_jax = kept.last, isinstance(error, jax.errors.JaxRuntimeError | ValueError)  # JAX raises either
+        if isinstance(error, PlantError) or not of_jax or "callback" not in str(error):
             raise
         if isinstance(last, PlantError):
             raise last from last.__cause__
@@ -227,3 +284,18 @@ def own_errors() -> Iterator[None]:
     finally:
         for logger in loggers:
             logger.removeFilter(kept)
+
+
+def missing_platform() -> str | None:
+    """Message if JAX is told to use a platform that it does not find (it then raises all kinds of errors); or None."""
+    for variable in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        asked = jax.config.values[variable.lower()]
+        if asked and asked != "cpu":
+            try:
+                for name in asked.split(","):
+                    jax.devices(name)
+            except Exception:
+                jax.config.update(variable.lower(), None)
+                there = ",".join(sorted({device.platform for device in jax.devices()}))
+                return f"{variable} is {asked!r}, but JAX finds only {there}: unset it, or set {variable}={there}"
+    return None

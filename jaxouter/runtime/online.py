@@ -30,6 +30,7 @@ from jaxouter.loop.environment import Environment
 from jaxouter.loop.observation import Memory, Observer, Signals
 from jaxouter.loop.policy import AffineParams
 from jaxouter.loop.references import SetPoint
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import arx
 from jaxouter.plants.arx import Model
 from jaxouter.plants.simulators import PlantOptions
@@ -114,6 +115,8 @@ class Live:
     """Updates before the learned policy may act."""
     kept: Kept
     """The fallback, which acts before that."""
+    reward: RewardConfig = rewards.PAPER
+    """Weights of the reward."""
 
     @classmethod
     def of(cls, config: TrainConfig, env: Environment, takeover: int, kept: Kept) -> Live:
@@ -132,7 +135,7 @@ class Live:
         policy = LearnedPolicy(env.observer, chosen.hidden)
         replay = Replay(FIELDS, 1 + COMPARED + EXPLORING, KEPT, env.observer.history)
         scale = config.reward_scale / env.plant.error_scale
-        return cls(env, policy, agent, cast(OffPolicy, agent.data), scale, replay, takeover, kept)
+        return cls(env, policy, agent, cast(OffPolicy, agent.data), scale, replay, takeover, kept, config.reward)
 
     @property
     def observer(self) -> Observer:
@@ -257,8 +260,9 @@ class Live:
             r_next=r,
             y_next=y,
         )
-        earlier, price = before.memory.r_tilde_past[0], rewards.params(self.env.plant)
-        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier)
+        plant, earlier = self.env.plant, before.memory.r_tilde_past[0]
+        price = rewards.params(plant, self.reward)
+        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier, plant.reward_terms)
         action, never = self._action(base, before.r, before.r_tilde), jnp.zeros_like(y)
         return jnp.stack([*signals, action, self.reward_scale * reward, never, never])
 

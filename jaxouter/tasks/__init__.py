@@ -16,14 +16,14 @@ TASKS: dict[str, Task] = {"pitch": PITCH, "heaters": HEATERS}
 
 
 def of(plant: str) -> Task:
-    """The task of a plant: the declared one, or an empty one around its maker.
+    """The task of a plant, whatever parameters its name sets: the declared one, or an empty one around its maker.
 
     Raises:
         ValueError: there is no such plant; lists the plants.
     """
-    maker = plants.resolve(plant)
-    if plant in TASKS:
-        return TASKS[plant]
+    maker, name = plants.resolve(plant), plants.base(plant)
+    if name in TASKS:
+        return TASKS[name]
     declared = inspect.unwrap(maker)
     return declared if isinstance(declared, Task) else Task(maker)
 

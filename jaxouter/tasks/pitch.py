@@ -36,17 +36,18 @@ ROBUST = {
 
 def _delayed(d1: float, d2: float, **rest: Any) -> Scenario:
     def long_enough(params: Any) -> Any:
-        return params.replace(max_delay=MAX_DELAY)
+        return params.replace(max_delay=max(params.max_delay, MAX_DELAY))
 
     return Scenario((SETPOINT,), {"d1": d1, "d2": d2}, paper=DELAYED, adapt=long_enough, **rest)
 
 
-def _parameters(*names: str, **static: Any) -> Any:
-    """Vary these parameters; `static` ones are set once."""
+def _vary(*names: str, longest: float | None = None) -> Any:
+    """Vary these parameters, of which delays are at most `longest` (s)."""
 
     def vary(params: Any, repeats: int, *values: jax.Array) -> Any:
         del repeats
-        return params.replace(**dict(zip(names, values, strict=True)), **static)
+        lines = {} if longest is None else {"max_delay": max(params.max_delay, longest), "late": None}
+        return params.replace(**dict(zip(names, values, strict=True)), **lines)
 
     return vary
 
@@ -67,16 +68,14 @@ PITCH = Task(
     reported=("paper", "delay-5.7", "delay-0.57", "delay-swapped"),
     stability=("paper", "delay-0.57", "delay-5.7", "delay-swapped", "uncertainty"),
     sweeps={
-        "pilot-delay": Sweep(
-            "paper", (Axis.linear("tau", "s", 0.0, 2.0, 21, 0.5),), _parameters("tau", max_delay=2.0, late=None)
-        ),
+        "pilot-delay": Sweep("paper", (Axis.linear("tau", "s", 0.0, 2.0, 21, 0.5),), _vary("tau", longest=2.0)),
         "controller-delays": Sweep(
             "paper",
             (Axis.linear("d1", "s", 0.0, 6.0, 25, 0.0), Axis.linear("d2", "s", 0.0, 6.0, 25, 0.0)),
-            _parameters("d1", "d2", max_delay=6.0, late=None),
+            _vary("d1", "d2", longest=6.0),
             stride=6,
         ),
-        "gain": Sweep("paper", (Axis.linear("gain", "1", 0.5, 1.5, 21, 1.0),), _parameters("gain")),
+        "gain": Sweep("paper", (Axis.linear("gain", "1", 0.5, 1.5, 21, 1.0),), _vary("gain")),
         "sensor-noise": Sweep("paper", (Axis.linear("noise", "crad", 0.0, 1.0, 21, 0.0),), repeats=8),
     },
 )

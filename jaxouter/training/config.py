@@ -13,6 +13,7 @@ import tyro
 from jaxouter import agents, plants, tasks
 from jaxouter.agents import AgentConfig
 from jaxouter.identification.steady_state import LEVELS
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
@@ -90,6 +91,8 @@ class TrainConfig:
     """Learn a correction to the static prefilter (identified first) instead of r~ itself."""
     reward_scale: float = 1.0
     """Factor on the reward (in the plant's error scales) that the agent learns from."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    """Weights of the reward that is trained on."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
     """Control steps spent to identify the dead time, for settings that were not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
@@ -112,6 +115,7 @@ class TrainConfig:
             if not -HUGE < value < HUGE:  # NaN is refused too
                 raise ValueError(f"{name} is {value}; it must be a number between -{HUGE:,} and {HUGE:,}")
         self.pretraining.check()
+        self.reward.check()
         self.agent.check()
         if (self.pretraining.plants > 1) and not self.randomise:
             raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
@@ -255,7 +259,8 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     Raises:
         ValueError: a field is missing, unknown or of the wrong type, or the agent is unknown.
     """
-    for name in ("agent", "plant_options", "pretraining"):
+    parts = {"plant_options": PlantOptions, "pretraining": PretrainingConfig, "reward": RewardConfig}
+    for name in ("agent", *parts):
         if not isinstance(values.get(name), dict):
             raise ValueError(f"{name} is {values.get(name)!r}; it must be an object with its fields")
     of_agent = dict(values["agent"])
@@ -264,8 +269,8 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
         raise ValueError(f"agent.name is {name!r}; it must be the name of an agent")
     kind = agents.resolve(name)
     whole = {**values, "agent": of_agent}
-    parts = (TrainConfig, whole), (PlantOptions, whole["plant_options"]), (PretrainingConfig, whole["pretraining"])
-    for cls, of_cls in (*parts, (kind, of_agent)):
+    nested = [(cls, whole[name]) for name, cls in parts.items()]
+    for cls, of_cls in ((TrainConfig, whole), *nested, (kind, of_agent)):
         names = {f.name for f in dataclasses.fields(cast(Any, cls))}
         if set(of_cls) != names:
             raise ValueError(

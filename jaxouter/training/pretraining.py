@@ -27,6 +27,7 @@ from jaxouter.identification import counterfactual, records
 from jaxouter.loop import closed_loop, rewards
 from jaxouter.loop.policy import AffineParams, Policy
 from jaxouter.loop.references import redrawn
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import PretrainingConfig
@@ -88,13 +89,22 @@ class DifferentiableRollout:
     """c > 0: a cost per step counts as c log(1 + cost / c); 0: it counts in full."""
     devices: int = 1
     """Devices of this process that share the episodes of a gradient step evenly."""
+    reward: RewardConfig = rewards.PAPER
+    """Weights of the reward."""
 
     @classmethod
     def of(
-        cls, config: PretrainingConfig, plant: Plant, policy: LearnedPolicy, batch: int, devices: int = 1
+        cls,
+        config: PretrainingConfig,
+        plant: Plant,
+        policy: LearnedPolicy,
+        batch: int,
+        devices: int = 1,
+        reward: RewardConfig = rewards.PAPER,
     ) -> DifferentiableRollout:
         """The roll-out as configured, on as many of the devices as can share a batch evenly."""
-        return cls(plant, policy, batch, config.noise, config.load, config.log_above, math.gcd(batch, devices))
+        devices = math.gcd(batch, devices)
+        return cls(plant, policy, batch, config.noise, config.load, config.log_above, devices, reward)
 
     def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
         """One episode: mean reward per step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
@@ -103,7 +113,7 @@ class DifferentiableRollout:
         plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
         smooth = jax.random.bernoulli(key_smooth)
         plant_params = jax.tree.map(partial(jnp.where, smooth), plant.noise_free(plant_params), plant_params)
-        price = rewards.params(plant)
+        price = rewards.params(plant, self.reward)
         r = redrawn(key_r, steps, *plant.setpoint_range)
         load, noise = self._load(key_load, steps), self._noise(key_noise, steps)
         state = plant.training_start(key_start, plant_params)
@@ -114,7 +124,17 @@ class DifferentiableRollout:
             r_k, noise_k, load_k, key = x
             loop = loop._replace(y_seen=loop.y + noise_k)
             after, remembered, reward, _ = closed_loop.step(
-                plant, plant_params, price, policy, policy_params, loop, memory, r_k, key, load=load_k
+                plant,
+                plant_params,
+                price,
+                policy,
+                policy_params,
+                loop,
+                memory,
+                r_k,
+                key,
+                load=load_k,
+                terms=plant.reward_terms,
             )
             return (after, remembered), (reward / plant.error_scale, memory, r_k, loop.y_seen)
 
@@ -225,6 +245,7 @@ def pretrain(
     begin: PretrainingState | None = None,
     devices: int = 1,
     say: Say = lambda what, done, of: None,
+    reward: RewardConfig = rewards.PAPER,
 ) -> Any:
     """Pretrain an actor on a plant model that is identified from recorded episodes.
 
@@ -239,13 +260,14 @@ def pretrain(
         begin: state from which to resume a pretraining with the same arguments; None: from its start.
         devices: of this process, to share the episodes of a gradient step.
         say: see `Say`.
+        reward: weights of the reward.
 
     Returns:
         The actor's parameters, for plain observations.
     """
     key_record, *keys = jax.random.split(key, 3)
     if plant.identified:
-        return pretrain_on(config, plant, plant_params, policy, learned, keys, report, begin, devices, say)
+        return pretrain_on(config, plant, plant_params, policy, learned, keys, report, begin, devices, say, reward)
     lags = config.lags or policy.observer.history
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
     models = []
@@ -256,7 +278,7 @@ def pretrain(
         models.append(counterfactual.fit(data, lags))
     model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
     return pretrain_on(
-        config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices, say
+        config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices, say, reward
     )
 
 
@@ -271,6 +293,7 @@ def pretrain_on(
     begin: PretrainingState | None = None,
     devices: int = 1,
     say: Say = lambda what, done, of: None,
+    reward: RewardConfig = rewards.PAPER,
 ) -> Any:
     """Pretrain an actor on a differentiable plant, of which each episode is a draw.
 
@@ -280,12 +303,12 @@ def pretrain_on(
     episodes and half the learning rate, which grows again while all is well.
 
     Args:
-        config, policy, learned, report, begin, devices, say: as for `pretrain`.
+        config, policy, learned, report, begin, devices, say, reward: as for `pretrain`.
         plant, plant_params: with the plant's own length of an episode.
         keys: two, for the whitening and for the episodes.
     """
     key_white, key_run = keys
-    base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices)]
+    base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices, reward)]
     longer = config.gradient_steps  # first step with longer episodes
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
@@ -302,9 +325,9 @@ def pretrain_on(
         if done == longer:  # longer episodes compile again
             say("compiling", 0, 0)
         found = stage.train(at.now, white, base, plant_params, chunk, jax.random.fold_in(key_run, done))
-        carry, reward = jax.device_get(found)  # inputs on several devices would compile again
-        reward = reward[:, 0]
-        first, reached = reward[0] if np.isfinite(reward[0]) else -np.inf, reward[-LAST:].mean()
+        carry, gained = jax.device_get(found)  # inputs on several devices would compile again
+        gained = gained[:, 0]
+        first, reached = gained[0] if np.isfinite(gained[0]) else -np.inf, gained[-LAST:].mean()
         best = first if done == longer else max(float(at.best), first)
         then = np.int32(done + len(chunk))
         if reached > COLLAPSED * best:  # both negative

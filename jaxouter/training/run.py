@@ -21,11 +21,11 @@ import jax
 from filelock import FileLock, Timeout
 
 import jaxouter
-from jaxouter import agents
+from jaxouter import agents, plants
 from jaxouter.agents import AGENTS, AgentConfig
 from jaxouter.loop.environment import EnvParams
-from jaxouter.plants import REGISTRY, Ranges
-from jaxouter.plants.registry import REGISTRATIONS, add, attribute
+from jaxouter.plants import Ranges
+from jaxouter.plants.registry import REGISTRATIONS, Maker, add, attribute
 from jaxouter.training import checkpoint
 from jaxouter.training.config import TrainConfig, from_dict, to_dict
 from jaxouter.training.devices import Fleet
@@ -34,7 +34,7 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.trainer import Trainer, build
 
-FORMAT = 2
+FORMAT = 3
 RUNS = Path("runs")  # default parent of run folders
 KEEP = 2  # checkpoints per seed
 SAVED = ("checkpoint-*.npz", "pretraining.npz")  # files that a seed can resume from
@@ -58,7 +58,7 @@ class RunFolder:
         Raises:
             ValueError: `out` exists or can't be made.
         """
-        base = RUNS / f"{config.plant}-{config.preset}-{config.seed}"
+        base = RUNS / f"{plants.slug(config.plant)}-{config.preset}-{config.seed}"
         candidates = (
             [out] if out is not None else [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 10_000))]
         )
@@ -93,7 +93,7 @@ class RunFolder:
         """
         config, was = _read(path)
         run = cls(path, config)
-        if (name := run.config.plant) not in REGISTRY:
+        if (name := plants.base(run.config.plant)) not in plants.REGISTRY:
             raise ValueError(
                 f"{path} is a run on {name}, {was.get('reference', 'of another machine')!r} when it was made; code is "
                 "never imported because a run folder names it, so name this plant on the command line"
@@ -147,9 +147,10 @@ class RunFolder:
         return build(self.config)
 
     @property
-    def drawn(self) -> tuple[Ranges, float]:
-        """Ranges of the plant's parameters in training, and the largest standard deviation of measurement noise."""
-        return self.config.randomise, self.config.pretraining.noise * self.trainer[0].env.observer.y_scale
+    def drawn(self) -> tuple[str, Ranges, float]:
+        """The plant of the training, ranges of its parameters, and the largest standard deviation of sensor noise."""
+        noise = self.config.pretraining.noise * self.trainer[0].env.observer.y_scale
+        return self.config.plant, self.config.randomise, noise
 
     @cached_property
     def fleet(self) -> Fleet:
@@ -338,7 +339,7 @@ def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
     except (OSError, ValueError, RecursionError):
         raise ValueError(f"{path} is not a run folder: it has no readable config.json") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{path}/config.json is not of format {FORMAT}, the one that this version reads")
+        raise ValueError(_of_other_format(path, content))
     try:
         config = from_dict(content["config"])
     except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -347,13 +348,21 @@ def _read(path: Path) -> tuple[TrainConfig, dict[str, Any]]:
     return config, plant if isinstance(plant, dict) else {}
 
 
-def add_plant(reference: str, path: Path | None) -> str:
+def _of_other_format(path: Path, content: Any) -> str:
+    """Why a run of another format is not read, and which version reads it."""
+    found, versions = (content.get(name) if isinstance(content, dict) else None for name in ("format", "versions"))
+    by = versions.get("jaxouter") if isinstance(versions, dict) else None
+    made = f"jaxouter {by} made it, and reads it" if isinstance(by, str) else "another version of jaxouter made it"
+    return f"{path}/config.json is of format {found}, and this version reads format {FORMAT}: {made}"
+
+
+def add_plant(reference: str | Maker, path: Path | None) -> str:
     """Register the plant that a command line names, with the options of the run in a folder; returns its short name.
 
     Raises:
         ValueError: there is no such plant, or the folder is not a run.
     """
-    if path is None:
+    if path is None or not isinstance(reference, str):
         return add(reference)
     folder = path if (path / "config.json").exists() else path.resolve().parent
     return add(reference, _read(folder)[0].plant_options)
@@ -407,7 +416,7 @@ def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
     """What results depend on besides the configuration; given one, also the origin of its plant if not built in."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")
     device = jax.devices()[0]
-    source = None if config is None else REGISTRATIONS.get(config.plant)
+    source = None if config is None else REGISTRATIONS.get(plants.base(config.plant))
     return {
         "versions": {"jaxouter": jaxouter.__version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},

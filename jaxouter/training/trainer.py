@@ -106,7 +106,19 @@ class Trainer:
             def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
                 report(at, lambda: with_actor(actor()))
 
-            actor = pretrain(cfg, plant, params.plant, self.policy, learned, key_start, reported, begin, devices, say)
+            actor = pretrain(
+                cfg,
+                plant,
+                params.plant,
+                self.policy,
+                learned,
+                key_start,
+                reported,
+                begin,
+                devices,
+                say,
+                self.config.reward,
+            )
             state = with_actor(actor)
         return state
 
@@ -147,6 +159,7 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         integral_steps=config.integral_steps,
         goal=SetPoint(*plant.setpoint_range, config.redraw),
         drawn=config.randomise,
+        reward=config.reward,
     )
     start = config.pretraining
     lags, most = start.lags or env.observer.history, (start.episode_steps or plant.episode_steps) // 2

@@ -22,10 +22,10 @@ def houses():
 
 def test_the_houses_and_their_comfort_limit_are_drawn(houses, tmp_path):
     selected, traces = houses
-    sizes = [figures.paper(tmp_path / "paper.png", selected, traces, traces).stat().st_size]
+    sizes = [figures.save(figures.paper(selected, traces, traces), tmp_path / "paper.png").stat().st_size]
     bare = {name: of._replace(members=None) for name, of in traces.items()}
     for each, name in ((traces, "houses.png"), (bare, "mean.png")):
-        path = figures.response(tmp_path / name, selected[1], each[selected[1].id], each[selected[1].id])
+        path = figures.save(figures.response(selected[1], each[selected[1].id], each[selected[1].id]), tmp_path / name)
         assert path.read_bytes().startswith(b"\x89PNG")
         sizes.append(path.stat().st_size)
     assert sizes[1] > 1.02 * sizes[2]  # a picture of the houses holds more
@@ -33,5 +33,5 @@ def test_the_houses_and_their_comfort_limit_are_drawn(houses, tmp_path):
 
 def test_a_learning_curve_has_a_line_a_seed_and_the_levels(tmp_path):
     rows = [{"steps": 1000 * k, "mae": 3.0 / (k + 1), **({"reward": -1.0} if k else {})} for k in range(4)]
-    path = figures.learning_curve(tmp_path / "curve.png", {0: rows, 1: rows}, {"static": 3.4}, "MAE")
+    path = figures.save(figures.learning_curve({0: rows, 1: rows}, {"static": 3.4}, "MAE"), tmp_path / "curve.png")
     assert path.stat().st_size > 10_000

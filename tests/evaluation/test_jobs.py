@@ -16,9 +16,9 @@ from jaxouter.evaluation import cache, jobs, scenarios, sweeps
 from jaxouter.evaluation.baselines import BASELINES, identified
 from jaxouter.evaluation.baselines.clairvoyant import plan
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.comparison import GridErrors, Row, StabilityRow
 from jaxouter.evaluation.jobs import WITHIN, Done, Entrant, Job
 from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.results import GridErrors, Row, StabilityRow
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.stability import analyse
 from jaxouter.identification import steady_state

@@ -8,14 +8,16 @@ import jax
 import numpy as np
 import pytest
 
-from jaxouter import cli, compare, evaluate, plants, train
-from jaxouter.evaluation import pace, scenarios
+from jaxouter import evaluate, plants, train
+from jaxouter.evaluation import comparison, pace, scenarios
 from jaxouter.evaluation.policies import baseline
-from jaxouter.evaluation.policies import evaluate as evaluated
+from jaxouter.evaluation.policies import evaluate_on as evaluated
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import records, steady_state
+from jaxouter.library import learning
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
+from jaxouter.progress import showing
 from jaxouter.training.run import RunFolder
 from tests.training.small import TINY, small
 
@@ -105,8 +107,10 @@ def test_evaluation_and_comparison_say_how_long_they_take(capsys, tmp_path, monk
     evaluate.main(["--policy", "none", "--plant", "mine", "--scenario", "mine/steps", "--episodes", "2"])
     assert "about" not in capsys.readouterr().out
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    plan = compare.check(compare.Options("mine", policy=("none", "mpc"), out=tmp_path / "out"))
-    assert re.match(r"the plant takes 7 ms a control step: up to 8 min, where nothing of it is", compare.told(plan))
+    selected = comparison.select("mine", policies=["none", "mpc"], out=tmp_path / "out")
+    assert re.match(
+        r"the plant takes 7 ms a control step: up to 8 min, where nothing of it is", comparison.told(selected)
+    )
 
 
 @pytest.mark.usefixtures("mine")
@@ -126,11 +130,12 @@ def test_after_the_training_of_a_slow_plant_there_are_few_episodes(capsys, tmp_p
     run = RunFolder.create(small("mine"), tmp_path / "run")
     trainer, params = run.trainer
     finals = {0: trainer.fresh(jax.random.key(0), params)}
-    monkeypatch.setattr(train, "draw", lambda *_: "figure")
+    monkeypatch.setattr(learning, "draw", lambda *_: None)
     for seconds, asked, episodes in ((4.5, None, 4), (4.5, 2, 2)):
         rows = [{"seconds": 3 * 3 * 20 * 7e-3 * seconds}]  # of three policies on three scenarios
         monkeypatch.setattr(RunFolder, "rows", lambda run, seed, rows=rows: rows)
-        train.report(run, finals, 0.0, cli.progress(), asked)
+        with showing(True) as progress:
+            learning.report(run, finals, progress, asked)
         text = "evaluation: 3 scenarios of 4 episodes: about 5 s, at 7 ms a control step, as long as learning took"
         assert (text in capsys.readouterr().out) == (episodes == 4)
         assert set(json.loads((run.path / "summary.json").read_text())["episodes"].values()) == {episodes}

@@ -12,7 +12,9 @@ from playwright.sync_api import Page, sync_playwright
 
 from jaxouter.evaluation import comparison_figures, report, scenarios, statistics
 from jaxouter.evaluation.baselines import Kind
-from jaxouter.evaluation.comparison import (
+from jaxouter.evaluation.metrics import FiguresOfMerit, mae
+from jaxouter.evaluation.policies import NamedPolicy, baseline, evaluate_on
+from jaxouter.evaluation.results import (
     Comparison,
     GridErrors,
     LineSummary,
@@ -23,8 +25,6 @@ from jaxouter.evaluation.comparison import (
     Summary,
     SweepErrors,
 )
-from jaxouter.evaluation.metrics import FiguresOfMerit, mae
-from jaxouter.evaluation.policies import NamedPolicy, baseline, evaluate
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import steady_state
 from jaxouter.plants import make
@@ -45,7 +45,7 @@ class Written(NamedTuple):
 
 
 def policies() -> dict[str, NamedPolicy]:
-    hostile = NamedPolicy(HOSTILE, *steady_state.static(*make("pitch"), jax.random.key(1)))
+    hostile = NamedPolicy(HOSTILE, *steady_state.static(*make("pitch"), jax.random.key(1)), "pitch")
     return {"none": baseline("none", "pitch"), "static": baseline("static", "pitch"), HOSTILE: hostile}
 
 
@@ -87,7 +87,7 @@ def written(tmp_path_factory) -> Written:
     settings = {"name": HOSTILE, "gain": 3.0}
     infos = {name: PolicyInfo(kind, 1600, 0.1, settings, f"{HOSTILE} & more.") for name, kind in kinds.items()}
     chosen = [scenarios.get(name, 2) for name in SCENARIOS]
-    results = {name: evaluate(each, chosen) for name, each in named.items()}
+    results = {name: evaluate_on(each, chosen) for name, each in named.items()}
     limits = {identifier: found.figures.mae or 0.0 for identifier, found in results["static"].items()}
     rows = [
         row(name, identifier, figures, limits[identifier])
@@ -116,6 +116,7 @@ def written(tmp_path_factory) -> Written:
         stability=stability,
         seconds=1.0,
         command="python -m jaxouter.compare pitch",
+        folder="",
     )
     responses = {
         scenario.id: comparison_figures.responses(

@@ -139,4 +139,4 @@ HEATERS_RANGES = (("Pi", 0.3, 2.0), ("x_out", -15.0, 0.0), ("Ca", 7.0, 13.0), ("
     ],
 )
 def test_place_of_a_scenario_among_the_plants_of_a_training(name, ranges, noise, place):
-    assert scenarios.place(scenarios.get(name), ranges, noise) == place
+    assert scenarios.place(scenarios.get(name), name.split("/")[0], ranges, noise) == place

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from jaxouter.evaluation import statistics
-from jaxouter.evaluation.comparison import (
+from jaxouter.evaluation.results import (
     BestBaseline,
     GridErrors,
     Improvement,

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import msgspec
 import pytest
 
-from jaxouter import export, plants
+from jaxouter import plants
 from jaxouter.evaluation.verdict import Verdict, judge
+from jaxouter.library import Run
 from jaxouter.loop.policy import AffineParams
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import RunFolder
@@ -72,13 +73,15 @@ def run(tmp_path: Path) -> RunFolder:
 
 def test_export_refuses_what_is_worse_unless_forced(run: RunFolder) -> None:
     summary = run.path / "summary.json"
-    options = export.Options(run.path, format="npz")
+    path, learned = run.path / "controller.npz", Run(run, 0)
     for older in ({}, {"verdict": {"worse": [], "text": ""}}):
         summary.write_text(json.dumps({"median_seed": 0} | older))
-        assert export.check(options)[0] == run.path
+        with pytest.raises(ValueError, match="has no checkpoint yet"):  # what comes after the verdict
+            learned.export(path)
     summary.write_text(json.dumps({"median_seed": 0, "verdict": {"worse": [0], "text": "worse than none"}}))
     with pytest.raises(ValueError, match="seed 0: worse than none"):
-        export.check(options)
-    assert export.check(export.Options(run.path, format="npz", force=True))[0] == run.path
+        learned.export(path)
+    with pytest.raises(ValueError, match="has no checkpoint yet"):
+        learned.export(path, force=True)
     summary.write_text("{")
     assert run.verdict() == {}

@@ -25,7 +25,7 @@ from fmpy.fmi2 import fmi2Error
 from fmpy.validation import validate_fmu
 
 from jaxouter import export, plants
-from jaxouter.exports import c, fmu, verify
+from jaxouter.exports import c, files, fmu, verify
 from jaxouter.exports.spec import ControllerSpec
 from jaxouter.plants import registry
 from jaxouter.training.run import RunFolder
@@ -85,7 +85,7 @@ def compile_and_run(folder: Path, sources: list[Path], *flags: str, compiler: st
 
 @pytest.mark.parametrize(
     ("plant", "kind"),
-    [("pitch", kind) for kind in export.FORMATS] + [("heaters", kind) for kind in ("npz", "c", "fmu")],
+    [("pitch", kind) for kind in files.FORMATS] + [("heaters", kind) for kind in ("npz", "c", "fmu")],
 )
 def test_what_was_written_does_what_the_policy_does(runs, plant, kind, tmp_path, capsys):
     it = runs[plant]
@@ -103,8 +103,8 @@ def test_what_was_written_does_what_the_policy_does(runs, plant, kind, tmp_path,
     assert f"written: {path} (" in out
     text = f"range of r~: {found.at_a_step:.1e} at a step, {found.in_closed_loop:.1e} in closed loop"
     assert text in out
-    files = {path.name} | ({"controller.h"} if kind == "c" else set())
-    assert {each.name for each in tmp_path.iterdir()} == files
+    written = {path.name} | ({"controller.h"} if kind == "c" else set())
+    assert {each.name for each in tmp_path.iterdir()} == written
 
 
 def test_a_controller_of_other_numbers_is_noticed(pitch, tmp_path):
@@ -173,7 +173,7 @@ def test_command_writes_beside_the_run(pitch):
     before = path.read_bytes()
     again = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
     assert (again.returncode, again.stdout) == (2, "")
-    assert again.stderr == f"error: {path} exists; remove it, or choose another --out\n"
+    assert again.stderr == f"error: {path} exists; remove it, or choose another file\n"
     assert path.read_bytes() == before
     path.unlink()
 
@@ -205,7 +205,7 @@ def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
         (["pitch", "--format", "c", "--plant", "no"], "there is no plant 'no'; the plants are: pitch, heaters"),
         (["empty", "--format", "npz"], "empty/seed-0 has no checkpoint yet"),
         (["pitch", "--format", "c", "--out", "a.cpp"], "--out is a.cpp; for the format c its name must end in .c"),
-        (["pitch", "--format", "c", "--out", "there.c"], "there.h exists; remove it, or choose another --out"),
+        (["pitch", "--format", "c", "--out", "there.c"], "there.h exists; remove it, or choose another file"),
         (["pitch", "--format", "npz", "--out", "no/a.npz"], "no/a.npz can't be written: no must be a folder that you"),
     ],
 )
@@ -243,7 +243,7 @@ def test_what_a_format_needs_is_named(pitch, kind, missing, text, tmp_path, caps
     with pytest.raises(SystemExit) as end:
         pitch.export(kind, tmp_path / f"controller.{kind}")
     assert end.value.code == 2
-    assert capsys.readouterr().err == f"error: --format {kind} can't be made here: {text}\n"
+    assert capsys.readouterr().err == f"error: format {kind} can't be made here: {text}\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -269,7 +269,7 @@ def test_help_teaches_the_formats(capsys):
         export.main(["--help"])
     assert end.value.code == 0
     out = capsys.readouterr().out
-    for word in (*export.FORMATS, "--out", "FMI 2.0", "C99", "median seed"):
+    for word in (*files.FORMATS, "--out", "FMI 2.0", "C99", "median seed"):
         assert word in out
 
 
@@ -420,7 +420,7 @@ def test_smallest_controllers(pitch, history, hidden, tmp_path):
     spec = dataclasses.replace(pitch.spec, history=history, weights=weights, biases=biases)
     paths = {kind: tmp_path / f"controller.{kind}" for kind in ("onnx", "c", "fmu")}
     for kind, path in paths.items():
-        export.write(kind, path, spec, pitch.policy, pitch.params)
+        files._write(kind, path, spec, pitch.policy, pitch.params)
         with verify.opened(kind, path, spec) as controller:
             state, wanted = controller.init(2.0), spec.init(2.0)
             for r, y in [(5.0, 2.0), (5.0, 3.0), (-5.0, 1.0), (0.0, 0.0)]:

@@ -99,5 +99,5 @@ def test_the_table_has_units_and_the_figure_is_drawn(good: Validation, tmp_path:
     rows = dict(validation.table(good, "degC"))
     assert rows["rows"].startswith("1200 of 0.1 s, ")
     assert " degC, 99." in rows["held out, free run"]
-    path = figures.log_report(tmp_path / "log.png", good, "log:lag.csv", "degC")
+    path = figures.save(figures.log_report(good, "log:lag.csv", "degC"), tmp_path / "log.png")
     assert path.stat().st_size > 20_000

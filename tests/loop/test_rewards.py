@@ -110,7 +110,7 @@ def test_plant_without_thresholds_and_limits_pays_for_the_error_only() -> None:
 
 def test_divergence_is_configurable_and_costs_50_by_default() -> None:
     assert float(rewards.params(PITCH).divergence) == -50.0
-    assert float(rewards.params(PITCH, divergence=-7.0).divergence) == -7.0
+    assert float(rewards.params(PITCH, rewards.RewardConfig(divergence=-7.0)).divergence) == -7.0
 
 
 def test_constants_are_swept_under_vmap() -> None:

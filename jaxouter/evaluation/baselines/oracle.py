@@ -57,7 +57,8 @@ def returns(
 def differentiable(config: TrainConfig) -> tuple[DifferentiableRollout, Any]:
     """The roll-out with actor and disturbances of a configuration, and the parameters of its plant."""
     trainer, env = build_trainer(config)
-    return DifferentiableRollout.of(config.pretraining, trainer.env.plant, trainer.policy, BATCH), env.plant
+    plant = replace(trainer.env.plant, reward_terms=())  # the limit is of what is reported
+    return DifferentiableRollout.of(config.pretraining, plant, trainer.policy, BATCH), env.plant
 
 
 def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
@@ -70,7 +71,7 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
     def make_it() -> Tuned:
         trainer, params = build_trainer(config)
         key_actor, key_static, key_drawn, *keys = jax.random.split(jax.random.key(0), 5)
-        plant, of_plant = trainer.env.plant, params.plant
+        plant, of_plant = replace(trainer.env.plant, reward_terms=()), params.plant
         learned = LearnedParams(
             trainer.agent.actor(trainer.agent.init(key_actor)), static(*make(config.plant), key_static)[1]
         )
