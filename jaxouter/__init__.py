@@ -21,3 +21,9 @@ def __getattr__(name: str) -> Any:
     from jaxouter.loop.environment import make
 
     return make
+
+
+if sys.modules.get("gymnasium.envs.registration"):  # else not imported for this: it takes 0.2 s, and few need it
+    from jaxouter.runtime.registration import register as _register
+
+    _register()
