@@ -44,3 +44,9 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+if sys.modules.get("gymnasium.envs.registration"):  # else not imported for this: it takes 0.2 s, and few need it
+    from jaxouter.runtime.registration import register as _register
+
+    _register()

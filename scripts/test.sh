@@ -2,7 +2,7 @@
 # Lint, types and tests, in under 9 minutes on 2 cores.
 # --all, under 120 minutes: also the slow tests, all others in double precision, all but plants and loop with checks for
 # NaN, places broken on purpose, 20 kills, the default suite on a second Python, the code blocks of the documentation, and
-# stable-baselines3 on our environment (5 GB the first time, see peers.sh).
+# stable-baselines3 and rejax on our environments (6 GB the first time, see peers.sh).
 # --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time is in
 # benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
@@ -17,6 +17,12 @@ fast() {  # XLA compiles fast rather than well: most of what runs in tests is sm
 in_double() { JAX_ENABLE_X64=1 fast tests "$@"; }
 no_nan() { JAX_DEBUG_NANS=1 in_double "$@"; }
 by_peers() { PYTHONPATH=$root "$(PYTHON=$PYTHON bash scripts/peers.sh)" "$@"; }
+rejax() {  # gymnax itself on our environment too
+    local python
+    python=$(PYTHON=$PYTHON bash scripts/peers.sh rejax) || return
+    "$python" -m pytest tests/loop/test_spaces.py tests/runtime/test_gymnax.py || return
+    PYTHONPATH=$root "$python" scripts/examples/rejax_td3.py
+}
 second_python() {  # the default suite by the first of these that is there and is another than the default one
     local python version own
     own=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
@@ -61,6 +67,7 @@ elif [ "$1" = --all ]; then
     part "a second Python: the default suite" second_python
     part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py
+    part "rejax learns" rejax
     exit $failed
 else
     tests "$@"

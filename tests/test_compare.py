@@ -87,7 +87,7 @@ def test_comparison_json_has_the_keys_that_the_report_needs(compared):
     content = compared.content
     assert content.keys() == {
         "format", "plant", "y_unit", "time_unit", "family_seed", "date", "machine", "policies", "rows", "statistics",
-        "sweeps", "stability", "seconds", "command",
+        "sweeps", "stability", "seconds", "command", "folder",
     }  # fmt: skip
     assert [content[key] for key in ("format", "plant", "y_unit", "time_unit")] == [1, "pitch", "crad", "s"]
     assert content["machine"].keys() == {"versions", "device", "flags"}

@@ -4,13 +4,14 @@
     obs, state = env.reset(key, params)
     obs, state, reward, terminated, truncated, info = env.step(key, state, r_tilde, params)
 
-The action is r~ itself, in the plant's unit. One environment is unbatched; vmap for many.
+The action is r~ itself, in the plant's unit. One environment is unbatched; vmap for many. Spaces, `name`, `num_actions`
+and `default_params` are gymnax's too, except that `params` must always be passed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
 from jaxouter.loop.rewards import RewardConfig, RewardParams
 from jaxouter.loop.sensor import SensorParams
+from jaxouter.loop.spaces import Box, observation_space
 from jaxouter.plants import Plant, Ranges, randomised
 from jaxouter.plants import make as make_plant
 
@@ -61,6 +63,32 @@ class Environment:
     plant: Plant
     observer: Observer
     goal: Goal
+    default_params: EnvParams | None = field(default=None, repr=False, compare=False)
+    """The parameters that `make` returned with it. Pass them to compiled functions as an argument: environments that
+    differ in nothing else are equal, and share what is compiled."""
+
+    @property
+    def name(self) -> str:
+        """Name of the plant."""
+        return self.plant.name
+
+    @property
+    def num_actions(self) -> int:
+        """Length of an action."""
+        return 1
+
+    def action_space(self, params: EnvParams | None = None) -> Box:
+        """r~ within its bounds, (1,), in the plant's unit."""
+        del params
+        return Box(*self.plant.r_tilde_bounds, (1,), jnp.result_type(float))
+
+    def observation_space(self, params: EnvParams | None = None) -> Box:
+        """Observations (3 + 2H,) for r and y within the plant's `divergence_bounds`.
+
+        Sensor noise, a set-point outside them, or rounding may exceed these bounds: `step` does not clip.
+        """
+        del params
+        return observation_space(self.plant, self.observer)
 
     def reset(self, key: chex.PRNGKey, params: EnvParams) -> tuple[jax.Array, EnvState]:
         """Begin an episode: draw parameters, start and reference.
@@ -92,13 +120,15 @@ class Environment:
         Args:
             key: randomness of plant and sensor.
             state: at t_k.
-            action: r~_k, scalar, clipped to its bounds; NaN is replaced by r_k.
+            action: r~_k, () or (1,), clipped to its bounds; NaN is replaced by r_k.
             params: traced parameters.
 
         Returns:
             obs, state, reward, terminated (y diverged), truncated (the episode has its full length), and info with
             `final_observation` (obs before any reset), `r` and `y` (its reference and measured output).
         """
+        if jnp.shape(action) == (1,):  # as the action space has it
+            action = action[0]
         chex.assert_rank(action, 0)
         plant, p = self.plant, params.plant if state.plant_params is None else state.plant_params
         action = jnp.where(jnp.isnan(action), state.r, action)
@@ -189,5 +219,5 @@ def make(
     if drawn:
         plant, plant_params = randomised(plant, plant_params, drawn)
     goal = SetPoint(*plant.setpoint_range) if goal is None else goal
-    env = Environment(plant, Observer.of(plant, history, integral_steps), goal)
-    return env, EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant, reward))
+    params = EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant, reward))
+    return Environment(plant, Observer.of(plant, history, integral_steps), goal, params), params

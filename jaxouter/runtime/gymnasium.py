@@ -1,12 +1,13 @@
 """Gymnasium environments; needs the extra `gymnasium`.
 
-    import jaxouter.runtime.gymnasium  # registers jaxouter/Pitch-v0 and jaxouter/Heaters-v0
+    import gymnasium
+    import jaxouter  # registers jaxouter/Pitch-v0 and jaxouter/Heaters-v0, if gymnasium was imported before
 
     env = gymnasium.make("jaxouter/Pitch-v0", tau=0.5)
     envs = gymnasium.make_vec("jaxouter/Pitch-v0", num_envs=64, tau=0.5)
 
-They wrap `jaxouter.loop.environment` with NumPy in and out. Gymnasium 1.0 has no plug-ins: import this module first,
-or name it in the id, `gymnasium.make("jaxouter.runtime.gymnasium:jaxouter/Pitch-v0")`.
+They wrap `jaxouter.loop.environment` with NumPy in and out. Importing this module registers the ids too, whatever was
+imported before. `gymnasium.make("jaxouter.runtime.gymnasium:jaxouter/Pitch-v0")` needs no import at all.
 """
 
 from __future__ import annotations
@@ -20,38 +21,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxouter import plants
 from jaxouter.loop.environment import Environment, EnvParams, EnvState, make
-from jaxouter.loop.observation import Memory
+from jaxouter.runtime import registration
 
 try:
     import gymnasium
     from gymnasium.utils import seeding
+    from gymnasium.vector import AutoresetMode
 except ImportError as error:
-    raise ImportError('jaxouter.runtime.gymnasium needs Gymnasium: pip install "jaxouter[gymnasium]"') from error
-
-
-def observation_bounds(env: Environment) -> tuple[jax.Array, jax.Array]:
-    """Least and greatest observation for r and y within the plant's `divergence_bounds`; each (3 + 2H,).
-
-    An episode ends if y leaves them. The leaky integral is a running mean of r - y that starts at 0, so it has the
-    bounds of r - y.
-    """
-    limits = jnp.asarray(env.plant.divergence_bounds, float)
-    r_tilde = jnp.asarray(env.plant.r_tilde_bounds, float)
-    shape = (env.observer.history,)
-
-    def extreme(r: jax.Array, y: jax.Array, r_tilde: jax.Array) -> jax.Array:
-        # Every feature is monotone: it rises with r, past y, past r~ and the integral, and falls with y.
-        return env.observer.features(Memory(jnp.full(shape, r), jnp.full(shape, r_tilde), r - y), r, y)
-
-    return extreme(limits[0], limits[1], r_tilde[0]), extreme(limits[1], limits[0], r_tilde[1])
+    raise ImportError(
+        'jaxouter.runtime.gymnasium needs Gymnasium 1.1 or later: pip install "jaxouter[gymnasium]"'
+    ) from error
 
 
 def _seen(env: Environment, obs: jax.Array, state: EnvState) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The observation clipped to its bounds, which rounding, sensor noise or a far set-point may exceed; and info."""
+    """The observation clipped to its space, which rounding, sensor noise or a far set-point may exceed; and info."""
     info = {"r": state.r, "y": state.y_seen, "r_tilde": state.memory.r_tilde_past[0]}
-    return jnp.clip(obs, *observation_bounds(env)), info
+    space = env.observation_space()
+    return jnp.clip(obs, space.low, space.high), info
 
 
 # Compiled once for all instances with the same plant, observer and goal, whatever their parameters.
@@ -95,8 +82,8 @@ def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tupl
 
 def _spaces(env: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Observation space and action space of one loop."""
-    low, high = (np.asarray(bound, np.float32) for bound in observation_bounds(env))
-    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    space = env.observation_space()
+    return gymnasium.spaces.Box(np.float32(space.low), np.float32(space.high)), gymnasium.spaces.Box(-1.0, 1.0, (1,))
 
 
 def _draw(generator: np.random.Generator) -> np.uint32:
@@ -125,7 +112,7 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
     - Action, (1,): r~ scaled so that -1 and 1 are its bounds. Learners with continuous actions explore and saturate on
       that scale, and Gymnasium's checker asks for it. For r~ in the plant's unit:
       `gymnasium.wrappers.RescaleAction(env, *np.float32(env.functional.plant.r_tilde_bounds))`.
-    - Observation, (3 + 2H,): that of `jaxouter.loop.observation.Observer`, clipped to `observation_bounds`.
+    - Observation, (3 + 2H,): that of `jaxouter.loop.observation.Observer`, clipped to the space.
     - End: `terminated` if y diverged, `truncated` at the plant's `episode_steps` (bootstrap there), so it needs no
       `gymnasium.wrappers.TimeLimit`. It does not reset itself.
     - Info: r and y as in the observation, and the r~ before it, in the plant's unit. The reward uses the true y.
@@ -133,7 +120,7 @@ class OuterLoop(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": [],
-        "autoreset_mode": gymnasium.vector.AutoresetMode.DISABLED,
+        "autoreset_mode": AutoresetMode.DISABLED,
     }
 
     functional: Environment
@@ -208,7 +195,7 @@ class OuterLoops(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray])
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": [],
-        "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
     functional: Environment
@@ -315,10 +302,4 @@ def _batched(values: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
     return values | {f"_{name}": chosen.copy() for name in values}
 
 
-for _plant in plants.REGISTRY:
-    gymnasium.register(
-        f"jaxouter/{_plant.capitalize()}-v0",
-        entry_point=f"{__name__}:OuterLoop",
-        vector_entry_point=f"{__name__}:OuterLoops",
-        kwargs={"plant": _plant},
-    )
+registration.register()

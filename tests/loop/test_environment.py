@@ -99,11 +99,12 @@ def test_plants_of_the_paper_keep_shapes_and_precision(name: str) -> None:
     assert (obs.dtype, reward.dtype) == (FLOAT, FLOAT)
 
 
-def test_action_must_be_scalar() -> None:
+@pytest.mark.parametrize("shape", [(2,), (1, 1)])
+def test_action_must_be_one_number(shape: tuple[int, ...]) -> None:
     env, params = make()
     _, state = reset(env, KEY, params)
     with pytest.raises(AssertionError, match="rank"):
-        step_env(env, KEY, state, jnp.zeros(1), params)
+        step_env(env, KEY, state, jnp.zeros(shape), params)
 
 
 def test_resets_draw_start_and_set_point() -> None:
