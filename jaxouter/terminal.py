@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -55,21 +56,41 @@ def optional(what: str) -> Iterator[None]:
 
 
 def show(message: Warning | str, *_: object) -> None:
-    """Print a warning in one line, except for incomplete entries of the compilation cache.
+    """Print a warning in one line, but for those of `mended`."""
+    if not mended(str(message)):
+        print(f"warning: {message}", file=sys.stderr)
 
-    Such an entry was left by a killed process, or is being written now. JAX compiles, but never overwrites the entry,
-    so it is removed here; otherwise later processes would compile too.
+
+def mended(text: str) -> bool:
+    """Whether a warning is of JAX's compilation cache, and needs no more words.
+
+    An incomplete entry was left by a killed process, or is being written now. JAX compiles, but never overwrites the
+    entry, so it is removed here; otherwise later processes would compile too.
     """
-    text, folder = str(message), jax.config.values["jax_compilation_cache_dir"]
+    folder = jax.config.values["jax_compilation_cache_dir"]
     half = re.match("Error reading persistent compilation cache entry for '(.+?)'", text)
-    if text.startswith("Error writing persistent compilation cache entry"):
-        _not_kept(folder)
-    elif half is None:
-        print(f"warning: {text}", file=sys.stderr)
-    else:
+    if half is not None:
         with suppress(OSError):
             for entry in Path(folder).glob(f"{glob.escape(half[1])}-*-cache"):
                 entry.unlink(missing_ok=True)
+        return True
+    if text.startswith("Error writing persistent compilation cache entry"):
+        _not_kept(folder)
+        return True
+    return False
+
+
+def mend_cache() -> None:
+    """Treat warnings of the compilation cache as `show` does, and leave all others to whoever shows them now."""
+    before = warnings.showwarning
+    if before is not show and not getattr(before, "mends", False):
+
+        def shown(message: Warning | str, *rest: Any, **more: Any) -> None:
+            if not mended(str(message)):
+                before(message, *rest, **more)
+
+        shown.mends = True  # type: ignore[attr-defined]
+        warnings.showwarning = shown
 
 
 @functools.cache

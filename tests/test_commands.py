@@ -15,6 +15,7 @@ import pytest
 from tensorboardX.proto import event_pb2
 
 from jaxouter import evaluate, train
+from jaxouter.library import learning
 from jaxouter.plants import REGISTRY
 from jaxouter.training.config import to_dict
 from jaxouter.training.run import RunFolder
@@ -227,7 +228,7 @@ def test_run_without_or_with_a_damaged_checkpoint_is_refused(tmp_path, capsys):
 def test_run_of_one_plant_is_not_evaluated_on_another(trained, capsys):
     with pytest.raises(SystemExit):
         evaluate.main([str(trained[1]), "--scenario", "heaters/cold"])
-    assert "is a run on pitch; heaters/cold is another plant's" in capsys.readouterr().err
+    assert "the plant is pitch; heaters/cold is another plant's" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
@@ -280,8 +281,9 @@ def test_resume_of_a_finished_run_only_shows_it_again_also_where_nothing_can_be_
     def draw(*_: object) -> None:
         raise RuntimeError("no fonts")
 
-    monkeypatch.setattr(train, "draw", draw)
+    monkeypatch.setattr(learning, "draw", draw)
     _, folder = trained
+    (folder / "figures" / learning.MAIN_FIGURE).unlink()
     before = (folder / "seed-3" / "metrics.jsonl").read_text()
     summary = (folder / "summary.json").read_text()
     (folder / "summary.json").unlink()

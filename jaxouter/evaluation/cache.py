@@ -21,6 +21,7 @@ import numpy as np
 import platformdirs
 
 import jaxouter
+from jaxouter import terminal
 from jaxouter.plants import registry
 
 PACKAGE = Path(jaxouter.__file__).parent
@@ -70,6 +71,7 @@ def _unusable(why: str) -> None:
 
 def use_compilation_cache() -> None:
     """Keep compiled functions in the user's cache folder, unless JAX is configured otherwise."""
+    terminal.mend_cache()
     if not jax.config.values["jax_compilation_cache_dir"] and (folder := usable()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones

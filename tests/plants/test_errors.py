@@ -14,6 +14,7 @@ import pytest
 from jaxouter import check, cli, compare, evaluate, export, live, plants, train
 from jaxouter.evaluation import jobs
 from jaxouter.evaluation.jobs import Entrant, Job
+from jaxouter.library import learning
 from jaxouter.plants import host, registry, simulate
 from jaxouter.plants.errors import PlantError, said
 from tests.precision import makes_nan
@@ -126,9 +127,9 @@ def test_a_plant_that_fails_in_a_comparison_is_named(capsys):
 def test_a_plant_that_fails_after_learning_leaves_what_was_learned(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plants.REGISTRY["mine"] = lambda: MINE
-    monkeypatch.setattr(train, "chosen", lambda config: config)  # which would step it first
-    monkeypatch.setattr(train, "learn", lambda *_: {0: None})
-    monkeypatch.setattr(train, "report", lambda *_: simulate(*MINE, jnp.ones(8), jax.random.key(0)))
+    monkeypatch.setattr(learning, "chosen", lambda config, _: config)  # which would step it first
+    monkeypatch.setattr(learning, "_trained", lambda *_: {0: None})
+    monkeypatch.setattr(learning, "report", lambda *_: simulate(*MINE, jnp.ones(8), jax.random.key(0)))
     with pytest.raises(SystemExit) as end:
         train.main(["mine", "--out", "run", "--history", "2"])
     assert end.value.code == 2
