@@ -244,14 +244,14 @@ def test_given_folder_must_not_exist(tmp_path):
 def test_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a run folder"):
         RunFolder.open(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"format": 99}))
-    with pytest.raises(
-        ValueError, match="of format 99, and this version reads format 3: another version of jaxouter made it"
+    for content, text in (
+        ({"format": 99}, "of format 99, and this version reads format 3: another version of jaxouter made it"),
+        ({"format": 2, "versions": {"jaxouter": "0.1.0"}}, r"of format 2, .*: jaxouter 0\.1\.0 made it, and reads it"),
+        ({"format": 3, "config": {"plant": "pitch"}}, "is not a configuration"),
     ):
-        RunFolder.open(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"format": 2, "config": {"plant": "pitch"}}))
-    with pytest.raises(ValueError, match="is not a configuration"):
-        RunFolder.open(tmp_path)
+        (tmp_path / "config.json").write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=text):
+            RunFolder.open(tmp_path)
 
 
 def test_config_json_says_what_the_result_depends_on(tmp_path):
