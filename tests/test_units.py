@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from unittest.mock import patch
 
@@ -14,7 +13,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from jaxouter import check, compare, evaluate, plants, train
+import jaxouter
+from jaxouter import check, evaluation, plants
 from jaxouter.evaluation.baselines import clairvoyant
 from jaxouter.evaluation.baselines.qp import Condensed, Solver
 from jaxouter.evaluation.metrics import figures_of_merit, number
@@ -134,8 +134,8 @@ def Myriads():
 
 
 @pytest.mark.slow
-def test_the_commands_give_the_same_relative_figures_in_any_unit(tmp_path, monkeypatch, capsys):
-    """Train, evaluate, compare and check, within 1 %.
+def test_relative_figures_are_the_same_in_any_unit(tmp_path, monkeypatch, capsys):
+    """Of training, evaluation, comparison and check, within 1 %.
 
     Of what is learned within 3 %: another unit rounds otherwise, which training amplifies as it would another seed.
     """
@@ -144,16 +144,13 @@ def test_the_commands_give_the_same_relative_figures_in_any_unit(tmp_path, monke
     found = {}
     for name, unit in (("Ones", 1.0), ("Millionths", 1e-6), ("Myriads", 1e5)):
         plant = f"units.py:{name}"
-        train.main([plant, "--pretraining.gradient-steps", "500", "--out", f"run-{name}"])
+        run = jaxouter.learn(plant, out=f"run-{name}", pretraining={"gradient_steps": 500})
         check.main([plant])
-        evaluate.main([f"run-{name}", "--plant", plant, "--json", f"{name}.json"])
-        policies = ["--policy", "static", "pi", "mpc", "deepc", "inverse"]
-        compare.main([plant, "--run", f"run-{name}", *policies, "--sweep", "--out", f"compare-{name}"])
         assert re.search(r"DC gain\W+0\.5, y = ", capsys.readouterr().out)
-        of_evaluate = json.loads((tmp_path / f"{name}.json").read_text())["scenarios"]
-        rows = json.loads((tmp_path / f"compare-{name}" / "comparison.json").read_text())["rows"]
-        figures = {key: of["mae"] / unit for key, of in of_evaluate.items()}
-        figures |= {f"{row['policy']} {row['scenario']}": row["mae"] / unit for row in rows}
+        figures = {key: found.figures.mae / unit for key, found in run.evaluate().items()}
+        policies = ["static", "pi", "mpc", "deepc", "inverse"]
+        content = evaluation.compare(plant, [run.path], policies, sweep=(), out=f"compare-{name}")
+        figures |= {f"{row.policy} {row.scenario}": row.mae / unit for row in content.rows}
         found[name] = {key.replace(name, "lag"): value for key, value in figures.items()}
     learned = {key for key in found["Ones"] if key.startswith(("learned", "lag/"))}
     for name in ("Millionths", "Myriads"):

@@ -164,11 +164,11 @@ def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
 def test_a_stopped_run_says_how_to_go_on_and_does(tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_trained", lambda *_: None)
     with pytest.raises(Stopped, match=f"saved; resume with: python -m jaxouter.train --resume {tmp_path}/run"):
-        jaxouter.learn(ROOM, "quick", out=tmp_path / "run", progress=False)
+        jaxouter.learn(ROOM, "quick", out=tmp_path / "run", progress=False, set={"tau": 4})
     monkeypatch.undo()
     stopped = jaxouter.load(tmp_path / "run", plant=ROOM)
     assert stopped.summary is None
-    assert jaxouter.resume(stopped, progress=False).summary.results
+    assert "Room(tau=4)/day" in jaxouter.resume(stopped, progress=False).summary.results[0].scenarios
 
 
 def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
