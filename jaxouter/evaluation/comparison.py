@@ -123,7 +123,9 @@ def select(
     paths = [Path(path) for path in runs]
     named_plant = None if plant is None else add_plant(plant, *paths[:1] or (None,))
     opened = [open_run(path) for path in paths]
-    name = plants.with_parameters(named_plant or (opened[0][0].config.plant if opened else "pitch"), set or {})
+    of_run = opened[0][0].config.plant if opened else "pitch"
+    name = of_run if named_plant in (None, plants.base(of_run)) else named_plant
+    name = plants.with_parameters(name, set or {})
     for path, (run, _, _) in zip(paths, opened, strict=True):
         if plants.base(run.config.plant) != plants.base(name):
             raise ValueError(f"{path} is a run on {run.config.plant}; the comparison is on {name}")

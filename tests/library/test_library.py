@@ -6,17 +6,21 @@ import json
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+import jax
 import numpy as np
 import pytest
 
 import jaxouter
 from jaxouter import plants, train
-from jaxouter.evaluation import evaluate, jobs
+from jaxouter.evaluation import compare, evaluate, jobs
 from jaxouter.library import Stopped, learning
 from jaxouter.plants import registry
+from jaxouter.training.pretraining import DifferentiableRollout
+from jaxouter.training.run import RunFolder
 from tests.additions import room
 
 ROOM = str(Path(__file__).parents[1] / "additions" / "room.py") + ":Room"
@@ -95,6 +99,17 @@ def test_it_is_evaluated_drawn_and_exported(run, tmp_path):
         run.export(tmp_path / "a.exe")
 
 
+def test_it_is_compared_on_its_plant_with_other_parameters(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    own = {"set": {"outside": 5.0}, "out": tmp_path / "out", "progress": False}
+    found = compare(ROOM, [run.path], ["static"], ["day"], ["Room/tau"], **own)
+    assert found.plant == "Room(tau=4, outside=5.0)"
+    assert [row.policy for row in found.rows] == ["learned", "none", "static"]
+    (axis,) = found.sweeps["Room(tau=4, outside=5.0)/tau"].axes
+    assert (axis.nominal, axis.values) == (4, (2.0, 3.0, 4, 6.0))
+    assert {path.name for path in Path(found.folder).iterdir()} > {"report.html", "comparison.json"}
+
+
 def test_a_policy_of_ones_own_and_baselines_are_evaluated_alike(run):
     class Offset:
         host = True
@@ -115,7 +130,7 @@ def test_a_policy_of_ones_own_and_baselines_are_evaluated_alike(run):
 def test_in_a_thread_and_silent(tmp_path, capsys):
     found = []
     thread = threading.Thread(
-        target=lambda: found.append(jaxouter.learn(ROOM, "quick", out=tmp_path / "run", progress=False))
+        target=lambda: found.append(jaxouter.learn(ROOM, "quick", out=tmp_path / "run", progress=False, set={"tau": 4}))
     )
     thread.start()
     thread.join()
@@ -156,9 +171,13 @@ def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
     for each in (learned, none):
         figures = each.scenarios["Gentle/day"]
         assert each.trained_return["Gentle/day"] < figures.episode_return - 0.3 * figures.mae * 40
-    again = jaxouter.learn(TERM, "quick", out=tmp_path / "again", progress=False, reward={"alpha_g": 0.6, "terms": 0.0})
-    moved = [np.abs(a - b).max() for a, b in zip(parameters(run.path), parameters(again.path), strict=True)]
-    assert max(moved) > 1e-3
+    trainer, params = RunFolder(run.path, run.config).trainer
+    terms = []
+    for weight in (0.0, 1.0):
+        price = replace(run.config.reward, terms=weight)
+        rollout = DifferentiableRollout.of(run.config.pretraining, trainer.env.plant, trainer.policy, 1, reward=price)
+        terms.append(rollout.episode(trainer.policy, run.policy.params, params.plant, jax.random.key(0))[0])
+    assert terms[1] < terms[0]
 
 
 def test_a_stopped_run_says_how_to_go_on_and_does(tmp_path, monkeypatch):
@@ -173,22 +192,20 @@ def test_a_stopped_run_says_how_to_go_on_and_does(tmp_path, monkeypatch):
 
 def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
     """Named nowhere but here; in its place may come another one of its name."""
-    run = jaxouter.learn(room.Room, "quick", out=tmp_path / "task", progress=False)
-    assert run.config.plant == "Room"
 
     def cellar(outside=5.0):
         return room.make(outside=outside)
 
-    for gradient_steps in (2, 3):
-        settings = {"gradient_steps": gradient_steps, "episodes": 2}
-        out = tmp_path / str(gradient_steps)
-        run = jaxouter.learn(cellar, out=out, progress=False, set={"outside": 2.0}, pretraining=settings)
+    settings = {"gradient_steps": 2, "episodes": 2}
+    run = jaxouter.learn(cellar, out=tmp_path / "run", progress=False, set={"outside": 2.0}, pretraining=settings)
     assert run.config.plant == "cellar(outside=2.0)"
     assert "a Python object cellar" in (run.path / "config.json").read_text()
     assert jaxouter.load(run.path, plant=cellar).policy.plant == "cellar(outside=2.0)"
     work = [jobs.Job("identify", jobs.Entrant(name, "baseline"), "cellar") for name in ("none", "static")]
     done = jobs.spread(work, lambda: None, lambda *_: None)  # which other processes could not be given
     assert [each.found.settings["slope"] for each in done] == pytest.approx([1.0, 1.25], rel=1e-4)
+    assert registry.add(room.Room) == "Room"
+    assert registry.add(cellar) == "cellar"
     for wrong in (lambda: 1, lambda: 1 / 0):
         with pytest.raises(ValueError, match="the plant <function"):
             jaxouter.learn(wrong)
