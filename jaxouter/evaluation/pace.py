@@ -60,4 +60,4 @@ def duration(seconds: float) -> str:
 
 
 def _plant(identifier: str) -> Plant:
-    return make(identifier.split("/")[0])[0]
+    return make(scenarios.plant_of(identifier))[0]

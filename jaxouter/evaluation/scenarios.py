@@ -107,13 +107,18 @@ def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Builder]:
     return {f"{name}/{key}": build for key, build in (own | families).items()}
 
 
+def plant_of(identifier: str) -> str:
+    """The plant's name in a scenario's id, which may hold parameters, and so a slash of its own."""
+    return identifier.rpartition("/")[0] or identifier
+
+
 def builder(identifier: str, family_seed: int = FAMILY_SEED) -> Builder:
     """The function that makes the scenario called `identifier`, such as `pitch/paper`.
 
     Raises:
         ValueError: there is no such plant or scenario; lists those that exist.
     """
-    name = identifier.split("/")[0]
+    name = plant_of(identifier)
     scenarios = catalogue(name, family_seed)
     if identifier not in scenarios:
         raise ValueError(f"there is no scenario {identifier!r}; {name} has: {', '.join(scenarios)}")

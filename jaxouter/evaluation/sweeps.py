@@ -84,7 +84,7 @@ def builder(identifier: str) -> Builder:
     Raises:
         ValueError: there is no such plant or sweep; lists those that exist.
     """
-    name = identifier.split("/")[0]
+    name = scenarios.plant_of(identifier)
     sweeps = catalogue(name)
     if identifier not in sweeps:
         raise ValueError(f"there is no sweep {identifier!r}; {name} has: {', '.join(sweeps) or 'none'}")

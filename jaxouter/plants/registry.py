@@ -113,15 +113,8 @@ def add(
 
 def _add_object(maker: Maker) -> str:
     """Register a maker or a task of this process; returns its short name."""
-    try:
-        name = getattr(maker, "__name__", None) or maker()[0].name
-        made = maker()
-        plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
-        interface.shapes(plant, params)
-    except ValueError as error:
-        raise ValueError(f"the plant {maker!r}: {error}") from error
-    except Raised as error:
-        raise ValueError(f"the plant {maker!r} can't be made: {said(error)}") from error
+    _check(f"the plant {maker!r}", maker)
+    name = getattr(maker, "__name__", None) or maker()[0].name
     if name in plants.REGISTRY and name not in REGISTRATIONS:
         raise ValueError(f"the plant {maker!r} has the name {name!r} of a built-in plant; rename it")
     try:
@@ -147,17 +140,22 @@ def _add(reference: str, options: PlantOptions) -> str:
         other = REGISTRATIONS[name].reference if name in REGISTRATIONS else "a built-in plant"
         raise ValueError(f"{reference} has the short name {name!r}, which is that of {other}; rename it")
     if name not in REGISTRATIONS:
-        try:
-            made = make()
-            plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
-            interface.shapes(plant, params)
-        except ValueError as error:
-            raise ValueError(f"{reference}: {error}") from error
-        except Raised as error:
-            raise ValueError(f"{reference} can't be made: {said(error)}") from error
+        _check(reference, make)
         plants.REGISTRY[name] = make
         REGISTRATIONS[name] = source
     return name
+
+
+def _check(what: str, make: Maker) -> None:
+    """Raises ValueError if it does not make a plant; the message begins with `what`."""
+    try:
+        made = make()
+        plant, params = made if isinstance(made, tuple) and len(made) == 2 else (made, None)
+        interface.shapes(plant, params)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    except Raised as error:
+        raise ValueError(f"{what} can't be made: {said(error)}") from error
 
 
 def _find(reference: str, options: PlantOptions) -> tuple[str, Callable[..., tuple[Plant, Any]], Path]:
