@@ -363,7 +363,6 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(config.seed), FRESH)
     affine = {name: named.params for name, named in simple.items()}
-    weights = vars(config.reward), vars(rewards.PAPER) | {"terms": 0.0}
     terms = [term.__name__ for term in trainer.env.plant.reward_terms]
     summary = TrainingSummary(
         format=FORMAT,
@@ -372,7 +371,7 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
         steps=config.steps,
         identification_steps=config.identification_steps,
         updates=config.total_updates,
-        reward=TrainedReward(weights[0], terms, weights[1]),
+        reward=TrainedReward(vars(config.reward), terms, vars(rewards.PAPER) | {"terms": 0.0}),
         places={scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected},
         episodes={scenario.id: len(scenario.r) for scenario in selected},
         verdict=judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine),
