@@ -29,6 +29,7 @@ def ended(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # of which most is waiting where other work shares the cores
 def test_three_kills_change_nothing(tmp_path):
     soak = load("scripts", "soak")
     content = soak.soak(soak.Options(kills=3, within=8.0, seeds=1, steps=20_640, out=tmp_path / "soak.json"))
