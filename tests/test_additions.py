@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -11,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter import agents, compare, evaluate, export, live, plants, train
+import jaxouter
+from jaxouter import agents, evaluate, evaluation, export, live, plants, train
 from jaxouter.agents.returns import generalised_advantage
 from jaxouter.exports.spec import ControllerSpec
 from jaxouter.plants import registry
@@ -24,9 +26,7 @@ HERE = Path(__file__).parent / "additions"
 LEARNER, PLANT, BASELINE = (
     f"{HERE}/{name}" for name in ("reinforce.py:Reinforce", "room.py:Room", "proportional.py:Proportional")
 )
-SHAPE = ["--environments", "16", "--epoch", "6400", "--history", "2", "--reward-scale", "0.1"]
-LEARN = ["--preset", "paper", "--agent", LEARNER, *SHAPE]
-CASES = ["--scenario", "Room/day", "Room/frost"]
+SETTINGS = dict(environments=16, epoch=6_400, history=2, reward_scale=0.1, steps=64_000)
 STEP = "def step(r_tilde):\n    return 0.8 * r_tilde\n"
 
 
@@ -42,18 +42,16 @@ def folder(tmp_path_factory):
     """A run of the learner on the plant."""
     path = tmp_path_factory.mktemp("additions") / "run"
     with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS), patch.dict(agents.AGENTS):
-        train.main([PLANT, *LEARN, "--steps", "64000", "--seeds", "2", "--out", str(path)])
+        jaxouter.learn(PLANT, "paper", out=path, agent=LEARNER, seeds=2, progress=False, **SETTINGS)
     return path
 
 
-def opened(folder) -> RunFolder:
-    registry.add(PLANT)
-    agents.AGENTS[LEARNER] = registry.attribute(HERE / "reinforce.py", "Reinforce", "")
-    return RunFolder.open(folder)
+def opened(folder) -> jaxouter.Run:
+    return jaxouter.load(folder, plant=PLANT, agent=LEARNER)
 
 
 def test_the_learner_learns(folder):
-    rows = RunFolder.rows(opened(folder), 0)
+    rows = opened(folder).of_seed(0).metrics
     assert [row["updates"] for row in rows] == [20 * (i + 1) for i in range(10)]
     assert rows[-1]["mae"] < 0.5  # at first 2.1, by the static prefilter 0.42
     assert rows[-1]["reward"] > rows[0]["reward"]
@@ -62,12 +60,11 @@ def test_the_learner_learns(folder):
 
 
 def test_a_training_goes_on_where_it_was_stopped(folder, tmp_path):
-    config = train.parse([PLANT, *LEARN, "--steps", "64000"]).config
-    run = RunFolder.create(config, tmp_path / "stopped")
+    whole = opened(folder)
+    run = RunFolder.create(replace(whole.config, seeds=1), tmp_path / "stopped")
     assert epochs.train(run, stop=lambda: True) is None
-    finals = epochs.train(run)
-    assert finals is not None
-    chex.assert_trees_all_equal(finals[0].agent, jax.device_get(opened(folder).load(0)[0].agent))
+    assert epochs.train(run) is not None
+    chex.assert_trees_all_equal(opened(run.path).policy.params, whole.of_seed(0).policy.params)
 
 
 def test_a_run_whose_agent_is_not_named_says_so(folder, capsys):
@@ -76,22 +73,25 @@ def test_a_run_whose_agent_is_not_named_says_so(folder, capsys):
     assert "there is no agent" in capsys.readouterr().err
 
 
-def test_evaluated_exported_compared_and_live(folder, tmp_path, monkeypatch):
+def test_the_commands_know_them_by_their_files(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     named = ["--plant", PLANT, "--agent", LEARNER]
     evaluate.main([str(folder), *named, "--json", "found.json"])
     assert set(json.loads(Path("found.json").read_text())["scenarios"]) == {"Room/day", "Room/frost", "Room/steps"}
     export.main([str(folder / "seed-0"), *named, "--format", "npz", "--out", "controller.npz", "--force"])
     assert ControllerSpec.load(Path("controller.npz")).plant == "Room"
-    compare.main(
-        [PLANT, "--agent", LEARNER, "--run", str(folder), "--policy", BASELINE, "static", *CASES, "--out", "compare"]
-    )
-    content = json.loads(Path("compare/comparison.json").read_text())
-    policies = content["policies"]
-    assert (policies[BASELINE]["kind"], policies[BASELINE]["note"]) == ("baseline", "r~ = r + gain (r - y).")
-    assert policies[BASELINE]["settings"]["gain"] > 0
-    assert set(content["sweeps"]) == {"Room/tau"}
-    radii = [row["spectral_radius"] for row in content["stability"] if row["policy"] == "learned"]
+
+
+def test_compared_and_live(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named = ["--plant", PLANT, "--agent", LEARNER]
+    cases = [PLANT, [folder], [BASELINE, "static"], ["day", "frost"]]
+    content = evaluation.compare(*cases, agents=[LEARNER], out="compare", progress=False)
+    tuned = content.policies[BASELINE]
+    assert (tuned.kind, tuned.note) == ("baseline", "r~ = r + gain (r - y).")
+    assert tuned.settings["gain"] > 0
+    assert set(content.sweeps) == {"Room/tau"}
+    radii = [row.spectral_radius for row in content.stability if row.policy == "learned"]
     assert len(radii) == 2 * 5  # of the stability scenarios, at five set-points each
     assert all(0.0 < radius < 1.0 for radius in radii)
     Path("loop.py").write_text(STEP)
@@ -100,11 +100,9 @@ def test_evaluated_exported_compared_and_live(folder, tmp_path, monkeypatch):
 
 
 def test_the_plant_has_presets_scenarios_and_a_sweep_of_its_own(tmp_path):
-    train.main([PLANT, "--preset", "quick", "--out", str(tmp_path / "run")])
-    run = opened(tmp_path / "run")
+    run = jaxouter.learn(PLANT, "quick", out=tmp_path / "run", progress=False)
     assert (run.config.preset, run.config.agent.hidden, run.config.pretraining.gradient_steps) == ("quick", (8, 8), 20)
-    summary = json.loads((run.path / "summary.json").read_text())
-    assert set(summary["results"][0]["scenarios"]) == {"Room/day"}
+    assert set(run.summary.results[0].scenarios) == {"Room/day"}
 
 
 @pytest.mark.parametrize(
@@ -166,7 +164,10 @@ def test_the_gradient_is_that_of_the_expected_reward():
         (["--agent", "sac"], "there is no agent 'sac'; the agents are: ddpg"),
         (["--agent", f"{HERE}/room.py:ROOM"], "it must be a subclass of jaxouter.agents.AgentConfig"),
         (["--agent", f"{ROOT}/jaxouter/agents/agent.py:AgentConfig"], "does not define build, data"),
-        ([*LEARN, "--steps", "1008"], "steps is 1008; it must be a multiple of 320: agent.unroll = 20 steps of 16 env"),
+        (
+            ["--agent", LEARNER, "--environments", "16", "--epoch", "6400", "--steps", "1008"],
+            "steps is 1008; it must be a multiple of 320: agent.unroll = 20 steps of 16 env",
+        ),
     ],
 )
 def test_mistakes_are_named(options, text, capsys):

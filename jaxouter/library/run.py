@@ -16,7 +16,7 @@ from jaxouter.evaluation.drawing import Figure
 from jaxouter.evaluation.policies import NamedPolicy, Results, TrainingSummary
 from jaxouter.exports import files
 from jaxouter.exports.spec import ControllerSpec
-from jaxouter.plants import base
+from jaxouter.plants import Ranges, base
 from jaxouter.plants.registry import Maker, own_errors
 from jaxouter.progress import Progress, showing
 from jaxouter.runtime import Controller
@@ -70,7 +70,7 @@ class Run:
         return tuple(self._folder.seeds)
 
     @property
-    def drawn(self) -> tuple[str, Any, float]:
+    def drawn(self) -> tuple[str, Ranges, float]:
         """See `RunFolder.drawn`."""
         return self._folder.drawn
 
