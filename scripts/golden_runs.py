@@ -70,7 +70,7 @@ def deviation(run: jaxouter.Run) -> float:
 
 def made(plant: str, preset: str) -> jaxouter.Run:
     """Train a golden run, and keep what a later version must read."""
-    of_agent = {f"agent.{name}": value for name, value in AGENT.items()}
+    of_agent: dict[str, Any] = {f"agent.{name}": value for name, value in AGENT.items()}
     out = path(plant, preset)
     run = jaxouter.learn(plant, preset, out=out, progress=False, episodes=1, **SETTINGS[preset], **of_agent)
     shutil.rmtree(out / "figures", ignore_errors=True)

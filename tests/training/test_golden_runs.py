@@ -48,6 +48,7 @@ def test_a_finished_run_is_evaluated_again_and_a_stopped_one_goes_on(tmp_path):
         warnings.simplefilter("ignore")  # versions and flags are others
         again = jaxouter.resume(jaxouter.load(folder), progress=False, episodes=1)
         assert (newest.read_bytes(), run.rows(0)) == (whole, rows)
+        assert again.summary is not None
         figures = again.summary.results[0].scenarios["pitch/paper"]
         assert figures.mae == pytest.approx(summary["results"][0]["scenarios"]["pitch/paper"]["mae"], rel=1e-3)
         newest.unlink()
