@@ -22,7 +22,8 @@ def main(arguments: list[str] | None = None) -> None:
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         lines = [f"  {command:<10}{what}" for command, what in COMMANDS.items()]
-        print("\n".join(["usage: jaxouter COMMAND ...", "", *lines, "", "jaxouter COMMAND --help shows its options."]))
+        end = "jaxouter COMMAND --help shows its options, jaxouter --version the version."
+        print("\n".join(["usage: jaxouter COMMAND ...", "", *lines, "", end]))
         return
     if name == "--version":
         print(jaxouter.__version__)

@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # Lint, types and tests, in under 9 minutes on 2 cores.
 # --all, under 120 minutes: also the slow tests, all others in double precision, all but plants and loop with checks for
-# NaN, places broken on purpose, 20 kills, the default suite on a second Python, the code blocks of the documentation, and
-# stable-baselines3 and rejax on our environments (6 GB the first time, see peers.sh).
+# NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in an environment of its
+# own, the default suite on a second Python, the code blocks of the documentation, and stable-baselines3 and rejax on our
+# environments (6 GB the first time, see peers.sh).
 # --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time is in
 # benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
@@ -64,6 +65,8 @@ elif [ "$1" = --all ]; then
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" fast "$PYTHON" scripts/mutants.py
     part "20 kills" "$PYTHON" scripts/soak.py
+    part "golden run folders" "$PYTHON" scripts/golden_runs.py
+    part "a wheel in a fresh environment" bash scripts/wheel.sh
     part "a second Python: the default suite" second_python
     part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py
