@@ -97,7 +97,11 @@ def load(path: Path, like: Tree) -> tuple[Tree, dict[str, Any]]:
     for name, leaf in wanted.items():
         array, stored = arrays[name], jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
         if array.shape != stored.shape or array.dtype != stored.dtype:
-            raise ValueError(f"{path}: {name} is {array.dtype}{array.shape}, expected {stored.dtype}{stored.shape}")
+            of_x64 = array.shape == stored.shape and {"float32", "float64"} == {str(array.dtype), str(stored.dtype)}
+            why = "; JAX_ENABLE_X64 was another one when it was saved" if of_x64 else ""
+            raise ValueError(
+                f"{path}: {name} is {array.dtype}{array.shape}, expected {stored.dtype}{stored.shape}{why}"
+            )
         leaves.append(jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(leaf) else jnp.asarray(array))
     return jax.tree.unflatten(jax.tree.structure(like), leaves), header
 
