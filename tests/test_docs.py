@@ -1,5 +1,6 @@
 """The site: it builds, says where all of it is, and needs no network; its code blocks are found and run."""
 
+import json
 import os
 import re
 import subprocess
@@ -122,6 +123,68 @@ def test_a_page_is_run_in_a_copy_of_its_own(tmp_path):
     for _ in range(2):
         done = docs.outcome(Path("page.md"), docs.blocks(markdown), tmp_path)
         assert (done.run, done.failed) == (1, False)
+
+
+NOTEBOOK = {
+    "cells": [
+        {"cell_type": "markdown", "id": "a", "metadata": {}, "source": ["# Page"]},
+        {"cell_type": "code", "id": "b", "metadata": {}, "source": ["a = 1\n", "open('new', 'w').close()"]},
+        {"cell_type": "code", "id": "c", "metadata": {"tags": ["remove-output"]}, "source": ["print(a)"]},
+        {"cell_type": "code", "id": "d", "metadata": {}, "source": ["2 / a"]},
+    ],
+    "metadata": {"kernelspec": {"name": "python3", "display_name": "mine"}},
+    "nbformat": 4,
+    "nbformat_minor": 5,
+}  # fmt: skip
+
+
+def notebook(folder, last="2 / a"):
+    """A notebook in this folder, before it has run."""
+    cells = [each | {"outputs": [], "execution_count": None} for each in NOTEBOOK["cells"][1:]]
+    cells[-1]["source"] = [last]
+    path = folder / "page.ipynb"
+    path.write_text(json.dumps(NOTEBOOK | {"cells": [NOTEBOOK["cells"][0], *cells]}))
+    return path
+
+
+def test_cells_of_a_notebook_are_its_code():
+    found = docs.cells(json.dumps(NOTEBOOK))
+    assert [(block.language, block.text, block.line) for block in found] == [
+        ("python", "a = 1\nopen('new', 'w').close()", 2), ("python", "print(a)", 3), ("python", "2 / a", 4)
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_notebook_is_run_in_its_folder_and_kept_without_what_differs(tmp_path, monkeypatch):
+    pytest.importorskip("nbclient")
+    monkeypatch.setattr(docs, "ROOT", tmp_path)
+    (tmp_path / "docs").mkdir()
+    page = notebook(tmp_path / "docs")
+    kept = []
+    for last, failed in (("2 / a", False), ("2 / a", False), ("a / 0", True)):
+        monkeypatch.setattr(docs, "copied", lambda copy, last=last: notebook(made(copy / "docs"), last))
+        done = docs.outcome(Path("docs/page.ipynb"), docs.cells(page.read_text()), tmp_path / "place", write=True)
+        assert (done.run, done.failed) == (3, failed)
+        kept.append(page.read_text())
+    assert kept[0] == kept[1] == kept[2]
+    _, first, silent, last = json.loads(kept[0])["cells"]
+    assert (first["outputs"], silent["outputs"], last["outputs"][0]["data"]) == ([], [], {"text/plain": ["2.0"]})
+    assert (last["id"], last["metadata"]) == ("cell-4", {})
+    assert "mine" not in kept[0]
+
+
+def made(folder):
+    """The folder, made."""
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs").rglob("*.ipynb")), ids=lambda path: path.name)
+def test_notebooks_are_small_and_name_no_machine(path):
+    text = path.read_text()
+    assert len(text) < 300_000
+    assert docs.stable(json.loads(text)) == text
+    assert not re.search(r"/(tmp|home|root|Users)/|iopub|20\d\d-\d\d-\d\dT", text)
 
 
 def test_pages_that_are_none_are_refused(capsys):
