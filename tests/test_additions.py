@@ -112,8 +112,8 @@ def test_the_plant_has_presets_scenarios_and_a_sweep_of_its_own(tmp_path):
             {"pretraining.gradient_step": 1},
             "there is no option 'pretraining.gradient_step'; there are: pretraining.gra",
         ),
-        ({"pretraining.gradient_steps": "many"}, "Expected `int`, got `str`"),
-        ({"agent.hidden": 8}, "Expected `array`, got `int`"),
+        ({"pretraining.gradient_steps": "many"}, "pretraining.gradient_steps is of type str; it must be int"),
+        ({"agent.hidden": 8}, "is of type int; it must be array"),
         ({"agent": "sac"}, "there is no agent 'sac'"),
     ],
 )

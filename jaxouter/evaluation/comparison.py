@@ -20,7 +20,7 @@ from jaxouter.evaluation import cache, comparison_figures, jobs, pace, report, s
 from jaxouter.evaluation.baselines import BUDGET, SIMPLE
 from jaxouter.evaluation.jobs import Done, Entrant, Job
 from jaxouter.evaluation.metrics import FiguresOfMerit
-from jaxouter.evaluation.policies import check
+from jaxouter.evaluation.policies import check, several
 from jaxouter.evaluation.results import Comparison
 from jaxouter.plants import Plant, host
 from jaxouter.plants.registry import REGISTRATIONS, Maker, own_errors
@@ -48,13 +48,13 @@ class Selection:
 
 def compare(
     plant: str | Maker | None = None,
-    runs: Sequence[Path | str] = (),
-    policies: Sequence[str] = (),
-    scenario: Sequence[str] = (),
-    sweep: Sequence[str] | None = None,
+    runs: Path | str | Sequence[Path | str] = (),
+    policies: str | Sequence[str] = (),
+    scenario: str | Sequence[str] = (),
+    sweep: str | Sequence[str] | None = None,
     *,
     set: Mapping[str, Any] | None = None,
-    agents: Sequence[str] = (),
+    agents: str | Sequence[str] = (),
     family_seed: int = scenarios.FAMILY_SEED,
     out: Path | str | None = None,
     progress: bool | Progress = True,
@@ -64,7 +64,7 @@ def compare(
 
     Args:
         plant: as a command names it; None: that of the runs, or pitch.
-        runs: run folders (all seeds), or folders of one seed.
+        runs: one or several run folders (all seeds), or folders of one seed.
         policies: baselines and limits, or `FILE.py:CLASS`; empty: all. `none` always takes part.
         scenario: ids, such as `pitch/paper` or `paper`; empty: all of the plant.
         sweep: ids, such as `pitch/gain` or `gain`; None: all of the plant; empty: none.
@@ -103,12 +103,12 @@ def compare(
 
 def select(
     plant: str | Maker | None = None,
-    runs: Sequence[Path | str] = (),
-    policies: Sequence[str] = (),
-    scenario: Sequence[str] = (),
-    sweep: Sequence[str] | None = None,
+    runs: Path | str | Sequence[Path | str] = (),
+    policies: str | Sequence[str] = (),
+    scenario: str | Sequence[str] = (),
+    sweep: str | Sequence[str] | None = None,
     set: Mapping[str, Any] | None = None,
-    agents: Sequence[str] = (),
+    agents: str | Sequence[str] = (),
     family_seed: int = scenarios.FAMILY_SEED,
     out: Path | str | None = None,
 ) -> Selection:
@@ -118,9 +118,9 @@ def select(
         ValueError: the arguments do not fit together, or name what does not exist.
     """
     check(None, family_seed)
-    for reference in agents:
+    for reference in several(agents):
         add_agent(reference)
-    paths = [Path(path) for path in runs]
+    paths = [Path(path) for path in several(runs)]
     named_plant = None if plant is None else add_plant(plant, *paths[:1] or (None,))
     opened = [open_run(path) for path in paths]
     of_run = opened[0][0].config.plant if opened else "pitch"
@@ -129,14 +129,14 @@ def select(
     for path, (run, _, _) in zip(paths, opened, strict=True):
         if plants.base(run.config.plant) != plants.base(name):
             raise ValueError(f"{path} is a run on {run.config.plant}; the comparison is on {name}")
-    chosen = scenarios.identifiers(name, scenario)
-    swept = list(sweeps.catalogue(name)) if sweep is None else sweeps.identifiers(name, sweep)
+    chosen = scenarios.identifiers(name, several(scenario))
+    swept = list(sweeps.catalogue(name)) if sweep is None else sweeps.identifiers(name, several(sweep))
     entrants = [
         Entrant("learned", "learned", str(run.path), seed)
         for run, median, of_run in opened
         for seed in (of_run if len(of_run) == 1 else sorted(of_run, key=lambda seed: seed != median))
     ]
-    entrants = list(dict.fromkeys([*entrants, *named(policies, plants.make(name)[0])]))
+    entrants = list(dict.fromkeys([*entrants, *named(several(policies), plants.make(name)[0])]))
     for entrant in entrants:
         if entrant.kind in ("learned", "user"):
             jobs.load(entrant, name)  # what can't be loaded is said before minutes of tuning

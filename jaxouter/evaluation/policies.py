@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -69,7 +70,7 @@ class TrainingSummary(Struct, frozen=True, kw_only=True):
     results: list[Evaluation]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NamedPolicy:
     """A policy with its parameters and the name that it has in results."""
 
@@ -78,6 +79,9 @@ class NamedPolicy:
     params: Any
     plant: str
     """Name of the plant that it was made for."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name} for {self.plant}>"
 
     def init(self, r0: Any, y0: Any) -> Any:
         """Carry before the first step, from the first reference and output."""
@@ -161,11 +165,10 @@ def evaluate(
         ValueError: there is no such policy, plant or scenario, or the policy failed.
     """
     check(episodes, family_seed)
-    wanted = (scenario,) if isinstance(scenario, str) else scenario
     with own_errors(), showing(progress) as progress:
         default = policy.plant if isinstance(policy, NamedPolicy) else "pitch"
         plant = add(plant or default, parameters=set)
-        names = scenarios.identifiers(plant, wanted)
+        names = scenarios.identifiers(plant, several(scenario))
         chosen = named(policy, plant, progress)
         rollouts = 1 if chosen.name == "none" else 2
         if pace.seconds(names, episodes, rollouts) > pace.SAID:
@@ -181,6 +184,11 @@ def evaluate(
                 results |= evaluate_on(chosen, [each])
             progress.advance(work(chosen.name, each))
     return results
+
+
+def several(given: Any) -> tuple[Any, ...]:
+    """What is given, one text or path or many of them, as a tuple."""
+    return (given,) if isinstance(given, str | Path) else tuple(given)
 
 
 def check(episodes: int | None, family_seed: int) -> None:

@@ -130,3 +130,6 @@ class Comparison(Struct, frozen=True, kw_only=True):
     seconds: float
     command: str
     folder: str  # of the report
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {', '.join(self.policies)} on {self.plant}: {self.folder}>"

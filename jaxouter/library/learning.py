@@ -32,11 +32,11 @@ from jaxouter.evaluation.policies import (
 )
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
-from jaxouter.library.run import Run
+from jaxouter.library.run import Run, load
 from jaxouter.loop import rewards
-from jaxouter.plants import Plant, make, slug
+from jaxouter.plants import Plant, base, make, slug
 from jaxouter.plants.errors import PlantError
-from jaxouter.plants.registry import Maker, add, own_errors
+from jaxouter.plants.registry import REGISTRATIONS, Maker, add, own_errors
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.progress import Progress, clock, showing
 from jaxouter.terminal import Interrupt, optional
@@ -72,7 +72,7 @@ def learn(
     out: Path | str | None = None,
     progress: bool | Progress = True,
     *,
-    agent: str | None = None,
+    agent: str | Mapping[str, Any] | None = None,
     set: Mapping[str, Any] | None = None,
     episodes: int | None = None,
     tensorboard: bool = False,
@@ -89,7 +89,8 @@ def learn(
         seed: of all random numbers.
         out: new folder for the run; None: runs/PLANT-PRESET-SEED.
         progress: whether to show progress.
-        agent: None: the preset's; another one by name, or FILE.py:CLASS.
+        agent: None: the preset's; another one by name, or FILE.py:CLASS. Settings such as `{"discount": 0.9}` are of
+            the preset's, or of the agent that is named among them: `{"name": "ddpg", "discount": 0.9}`.
         set: parameters of the plant, such as `{"tau": 0.7}`.
         episodes: of each scenario in the evaluation; None: the scenario's own number.
         tensorboard: whether to write TensorBoard events too.
@@ -106,29 +107,41 @@ def learn(
 
 
 def resume(
-    run: Run, progress: bool | Progress = True, *, episodes: int | None = None, tensorboard: bool = False
+    run: Run | Path | str,
+    progress: bool | Progress = True,
+    *,
+    episodes: int | None = None,
+    tensorboard: bool = False,
 ) -> Run:
-    """Resume a run that was stopped; arguments and errors as for `learn`."""
+    """Resume a run that was stopped, or that in a folder; other arguments and errors as for `learn`."""
     with own_errors():
+        run = run if isinstance(run, Run) else load(run)
         return training(run.config, resumes=run.path, progress=progress, episodes=episodes, events=tensorboard)
 
 
 def configured(
-    plant: str | Maker, name: str, agent: str | None, parameters: Mapping[str, Any] | None, settings: Mapping[str, Any]
+    plant: str | Maker,
+    name: str,
+    agent: str | Mapping[str, Any] | None,
+    parameters: Mapping[str, Any] | None,
+    settings: Mapping[str, Any],
 ) -> TrainConfig:
     """The configuration of a training; arguments as for `learn`.
 
     Raises:
         ValueError: unknown plant, preset, agent or setting, or a wrong value.
     """
+    of_agent = {"name": agent} if agent is None or isinstance(agent, str) else {"name": None, **agent}
+    known_agent = add_agent(of_agent.pop("name"))
     flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        nested = value.items() if isinstance(value, Mapping) else ()
-        flat |= {f"{key}.{inner}": each for inner, each in nested} if nested else {key: value}
+    for key, value in {**settings, "agent": of_agent}.items():
+        flat |= (
+            {f"{key}.{each}": inner for each, inner in value.items()} if isinstance(value, Mapping) else {key: value}
+        )
     of_plant = {key: flat.pop(key) for key in list(flat) if key in PlantOptions.__dataclass_fields__}
     options = PlantOptions(**of_plant)
-    base = preset(add(plant, options, parameters), name, add_agent(agent))
-    return from_dict(to_dict(with_options(base, {**flat, "plant_options": options})))  # which looks at types too
+    default = preset(add(plant, options, parameters), name, known_agent)
+    return from_dict(to_dict(with_options(default, {**flat, "plant_options": options})))  # which looks at types too
 
 
 def training(
@@ -179,12 +192,12 @@ def training(
             kept = f"; what was learned is in {run.path}" if run.path.exists() else ""
             raise ValueError(f"{error}{kept}") from error
         except (OSError, NotFiniteError) as error:
-            saved = f"what was saved before is intact, {go_on(run.path)}" if run.path.exists() else "nothing was saved"
+            saved = f"what was saved before is intact, {go_on(run)}" if run.path.exists() else "nothing was saved"
             raise type(error)(f"{error}; {saved}") from error
         except KeyboardInterrupt:  # the second Ctrl-C, or one after the training
             finals = None
     if finals is None:
-        raise Stopped(f"saved; {go_on(run.path)}" if run.path.exists() else "nothing was saved")
+        raise Stopped(f"saved; {go_on(run)}" if run.path.exists() else "nothing was saved")
     return Run(run)
 
 
@@ -202,9 +215,12 @@ def chosen(config: TrainConfig, progress: Progress) -> TrainConfig:
     return from_dict(json.loads(devices.text_from_first(choice)))
 
 
-def go_on(path: Path) -> str:
-    """How to resume the run in a folder."""
-    return f"resume with: python -m jaxouter.train --resume {path}"
+def go_on(run: RunFolder) -> str:
+    """How to resume the run."""
+    source = REGISTRATIONS.get(base(run.config.plant))
+    if source is not None and source.session:
+        return f"resume with: jaxouter.resume(jaxouter.load({str(run.path)!r}, plant=...))"
+    return f"resume with: python -m jaxouter.train --resume {run.path}"
 
 
 def _trained(run: RunFolder, resumed: bool, events: bool, progress: Progress) -> dict[int, TrainState] | None:

@@ -26,7 +26,7 @@ from jaxouter.training.policy import LearnedPolicy
 from jaxouter.training.run import RunFolder, add_agent, add_plant, open_run
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunPolicy(NamedPolicy):
     """The learned policy of a run, without exploration: `init(r0, y0)`, `act(carry, r, y)`."""
 

@@ -28,8 +28,9 @@ from jaxouter.loop.references import Goal, SetPoint
 from jaxouter.loop.rewards import RewardConfig, RewardParams
 from jaxouter.loop.sensor import SensorParams
 from jaxouter.loop.spaces import Box, observation_space
-from jaxouter.plants import Plant, Ranges, randomised
+from jaxouter.plants import REGISTRY, Plant, Ranges, base, randomised
 from jaxouter.plants import make as make_plant
+from jaxouter.plants.registry import Maker, add
 
 RESET = 1  # folded into the key of a step that ends an episode
 
@@ -196,7 +197,7 @@ def _if_any(needed: jax.Array, function: Callable[..., Any], operands: tuple[Any
 
 
 def make(
-    name: str,
+    name: str | Maker,
     *,
     history: int | None = None,
     integral_steps: float | None = None,
@@ -208,13 +209,14 @@ def make(
     """An environment on the training distribution, and its parameters.
 
     Args:
-        name: plant, see `jaxouter.plants.make`.
+        name: the plant: a name for `jaxouter.plants.make`, FILE.py:NAME and the like, or your own maker or task.
         history, integral_steps: of the observation, see `Observer.of`.
         goal: reference generator; None: one set-point per episode, as in the paper.
         drawn: parameters to draw at each reset, see `jaxouter.plants.randomised`.
         reward: weights of the reward.
         **overrides: parameters of the plant.
     """
+    name = name if isinstance(name, str) and base(name) in REGISTRY else add(name)
     plant, plant_params = make_plant(name, **overrides)
     if drawn:
         plant, plant_params = randomised(plant, plant_params, drawn)

@@ -119,9 +119,13 @@ def _derived(name: str) -> Callable[..., tuple[Plant, Any]]:
     def renamed(plant: Plant) -> Plant:  # cached, so that it is compiled once
         return replace(plant, name=name)
 
+    @cache
+    def nominal() -> tuple[Plant, Any]:  # likewise, where the maker gives another plant each time
+        return maker(**values)
+
     @wraps(maker)
     def made(**overrides: Any) -> tuple[Plant, Any]:
-        plant, params = maker(**values | overrides)
+        plant, params = maker(**values | overrides) if overrides else nominal()
         return renamed(plant), params
 
     return made

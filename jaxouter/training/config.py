@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar, cast
@@ -17,6 +18,7 @@ from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
+INTERNAL = ("plant", "preset", "explored_steps", "plant_options")  # fields that are no options by name
 HUGE = 2**31  # numbers of a configuration must be smaller
 
 
@@ -228,8 +230,12 @@ def _changed(config: Config, options: tasks.Options, prefix: str) -> Config:
     for option, value in options.items():
         name, _, inner = option.removeprefix(prefix).partition(".")
         whole = not inner and (not dataclasses.is_dataclass(known.get(name)) or isinstance(value, type(known[name])))
-        if name not in known or not (whole or (inner and dataclasses.is_dataclass(known[name]))):
-            raise ValueError(f"there is no option {option!r}; there are: {', '.join(prefix + each for each in known)}")
+        if not (whole or inner) and name in known:
+            first = dataclasses.fields(known[name])[0].name
+            raise ValueError(f"{option} is {value!r}; it has settings of its own, such as {option}.{first}")
+        if name not in known or (inner and not dataclasses.is_dataclass(known[name])):
+            there = ", ".join(prefix + each for each in known if each not in INTERNAL)
+            raise ValueError(f"there is no option {option!r}; there are: {there}")
         within = changes.get(name, known[name])
         changes[name] = _changed(within, {option: value}, f"{prefix}{name}.") if inner else value
     return dataclasses.replace(cast(Any, config), **changes)
@@ -276,4 +282,10 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
             raise ValueError(
                 f"fields of the configuration are missing or unknown: {sorted(map(str, set(of_cls) ^ names))}"
             )
-    return msgspec.convert(whole, TrainConfig, dec_hook=lambda _, found: msgspec.convert(found, kind))
+    try:
+        return msgspec.convert(whole, TrainConfig, dec_hook=lambda _, found: msgspec.convert(found, kind))
+    except msgspec.ValidationError as error:
+        found = re.fullmatch(r"Expected `(.+?)`, got `(.+?)`(?: - at `\$\.(.+?)`)?", str(error))
+        if found is None:
+            raise
+        raise ValueError(f"{found[3] or 'the configuration'} is of type {found[2]}; it must be {found[1]}") from None

@@ -70,6 +70,7 @@ def test_its_path_config_metrics_and_summary(run):
     (learned, *_) = run.summary.results
     assert row["mae"] == pytest.approx(learned.scenarios["Room(tau=4)/day"].mae)
     assert "Room(tau=4)" in repr(run)
+    assert repr(run.policy) == "<RunPolicy learned for Room(tau=4)>"
     assert run.of_seed(0).policy.spec.plant == "Room(tau=4)"
     with pytest.raises(ValueError, match=r"seed is 7; .* has: 0"):
         run.of_seed(7)
@@ -102,12 +103,13 @@ def test_it_is_evaluated_drawn_and_exported(run, tmp_path):
 def test_it_is_compared_on_its_plant_with_other_parameters(run, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     own = {"set": {"outside": 5.0}, "out": tmp_path / "out", "progress": False}
-    found = compare(ROOM, [run.path], ["static"], ["day"], ["Room/tau"], **own)
+    found = compare(ROOM, run.path, "static", "day", ["Room/tau"], **own)
     assert found.plant == "Room(tau=4, outside=5.0)"
     assert [row.policy for row in found.rows] == ["learned", "none", "static"]
     (axis,) = found.sweeps["Room(tau=4, outside=5.0)/tau"].axes
     assert (axis.nominal, axis.values) == (4, (2.0, 3.0, 4, 6.0))
     assert {path.name for path in Path(found.folder).iterdir()} > {"report.html", "comparison.json"}
+    assert repr(found).startswith("<Comparison of learned, none, static on Room(tau=4, outside=5.0): ")
 
 
 def test_a_policy_of_ones_own_and_baselines_are_evaluated_alike(run):
@@ -143,6 +145,11 @@ MISTAKES = [
     (dict(preset="best"), "there is no preset 'best' for pitch; the presets are: default, robust, paper"),
     (dict(steps=-1), "steps is -1; it must be positive"),
     (dict(pretraining={"gradient_step": 1}), "there is no option 'pretraining.gradient_step'; there are: "),
+    (dict(pretraining=5), "pretraining is 5; it has settings of its own, such as pretraining.gradient_steps"),
+    (dict(pretraining={"gradient_steps": "5"}), "pretraining.gradient_steps is of type str; it must be int"),
+    (dict(agent={"discounts": 0.9}), "there is no option 'agent.discounts'; there are: agent."),
+    (dict(agent={"name": "sarsa"}), "there is no agent 'sarsa'"),
+    (dict(stops=1), "there is no option 'stops'; there are: agent, seed"),
     (dict(episodes=0), "--episodes is 0; it must be at least 1"),
     (dict(reward={"alpha_g": -1.0}), "reward.alpha_g is -1.0; it must not be negative"),
     (dict(set={"tou": 1.0}), "plant 'pitch' has no parameter tou; it has: tau, d1, d2, W, "),
@@ -187,7 +194,7 @@ def test_a_stopped_run_says_how_to_go_on_and_does(tmp_path, monkeypatch):
     monkeypatch.undo()
     stopped = jaxouter.load(tmp_path / "run", plant=ROOM)
     assert stopped.summary is None
-    assert "Room(tau=4)/day" in jaxouter.resume(stopped, progress=False).summary.results[0].scenarios
+    assert "Room(tau=4)/day" in jaxouter.resume(stopped.path, progress=False).summary.results[0].scenarios
 
 
 def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
@@ -204,6 +211,7 @@ def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
     work = [jobs.Job("identify", jobs.Entrant(name, "baseline"), "cellar") for name in ("none", "static")]
     done = jobs.spread(work, lambda: None, lambda *_: None)  # which other processes could not be given
     assert [each.found.settings["slope"] for each in done] == pytest.approx([1.0, 1.25], rel=1e-4)
+    assert jaxouter.make(cellar)[0].plant.name == "cellar"
     assert registry.add(room.Room) == "Room"
     assert registry.add(cellar) == "cellar"
     for wrong in (lambda: 1, lambda: 1 / 0):

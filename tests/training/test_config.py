@@ -65,8 +65,8 @@ def test_numbers_of_numpy_are_numbers():
         ({"redraw": 1.5}, "redraw is 1.5"),
         ({"agent.noise_sigma": (0.0, 0.1)}, r"agent.noise_sigma is \(0.0, 0.1\)"),
         ({"agent.speed": 1}, "there is no option 'agent.speed'; there are: agent.hidden, agent.layer_norm,"),
-        ({"speed": 1}, "there is no option 'speed'; there are: plant, preset, agent,"),
-        ({"agent": "ddpg"}, "there is no option 'agent'; there are: plant"),
+        ({"speed": 1}, "there is no option 'speed'; there are: agent, seed,"),
+        ({"agent": "ddpg"}, "agent is 'ddpg'; it has settings of its own, such as agent.hidden"),
     ],
 )
 def test_errors_name_field_value_and_what_is_allowed(change, text):
