@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Lint, types and tests, in under 9 minutes on 2 cores.
-# --all, under 120 minutes: also the slow tests, all others in double precision, all but plants and loop with checks for
+# --all, under 120 minutes: all tests as users compile, the slow ones too, all others in double precision, all but plants and loop with checks for
 # NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in an environment of its
 # own, the default suite on a second Python, the code blocks of the documentation, and stable-baselines3 and rejax on our
 # environments (6 GB the first time, see peers.sh).
@@ -60,7 +60,8 @@ elif [ "$1" = --all ]; then
     [ -e "$result" ] ||
         printf '`scripts/test.sh --all`, %s CPUs\n\n| part | last line | minutes | commit | date |\n|---|---|---|---|---|\n' \
             "$(nproc)" >"$result"
-    part "all tests, the slow ones too" tests --all
+    part "the default suite, compiled as for users" tests
+    part "the slow tests" tests --all -m slow
     part "plants and loop, double precision" in_double --all tests/plants tests/loop
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
     part "places broken on purpose" fast "$PYTHON" scripts/mutants.py
