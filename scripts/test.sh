@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Lint, types and tests, in under 9 minutes on 2 cores.
-# --all, under 120 minutes: all tests as users compile, the slow ones too, all others in double precision, all but plants and loop with checks for
-# NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in an environment of its
-# own, the default suite on a second Python, the code blocks of the documentation, and stable-baselines3 and rejax on our
-# environments (6 GB the first time, see peers.sh).
+# --all, under 120 minutes: all tests as users compile, the slow ones too, all others in double precision, all but plants
+# and loop with checks for NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in
+# an environment of its own, the default suite on a second Python, the code blocks of the documentation, and
+# stable-baselines3 and rejax on our environments (6 GB the first time, see peers.sh).
 # --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time is in
 # benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
