@@ -21,6 +21,7 @@ from jaxouter import agents, plants, tasks
 from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
 from jaxouter.identification.steady_state import IdentificationWarning
+from jaxouter.library.learning import ChoiceWarning
 from jaxouter.plants.registry import FORMS, own_errors
 from jaxouter.terminal import console, last, show
 from jaxouter.training.run import RunWarning
@@ -38,6 +39,7 @@ def user_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
         arguments: of the command; None: those of the program. With `--debug` the traceback is shown too.
     """
     warnings.simplefilter("always", RunWarning)
+    warnings.simplefilter("always", ChoiceWarning)
     warnings.simplefilter("once", IdentificationWarning)
     warnings.showwarning = show
     try:

@@ -134,6 +134,7 @@ def Myriads():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_relative_figures_are_the_same_in_any_unit(tmp_path, monkeypatch, capsys):
     """Of training, evaluation, comparison and check, within 1 %.
 

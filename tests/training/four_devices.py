@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
+from jaxouter.agents import AGENTS
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.devices import Fleet, spread
 from jaxouter.training.epochs import train
@@ -65,7 +66,8 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
 
 
 @pytest.mark.parametrize(("seeds", "shards"), [(1, 4), (2, 2)])
-def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
+def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards, monkeypatch):
+    monkeypatch.setitem(AGENTS, "reinforce", Reinforce)
     config = replace(small(seeds=seeds, devices=4, steps=1_280, epoch=640), agent=Reinforce(rate=1e-3, sigma=0.1))
     fleet = Fleet.of(config)
     assert fleet.trainer.environments.shards == shards

@@ -52,16 +52,16 @@ def white(rollout, base):
 
 @pytest.mark.slow
 def test_it_is_as_good_as_pi_and_mpc(tuned):
-    """Within 2 % in return, on training episodes that none of them has seen."""
+    """Within 3 % in return, on training episodes that none of them has seen."""
     plant, params = lag.make()
     episodes = training_episodes(plant, params, jax.random.key(1))
     reached = score(*oracle.build(plant, tuned), episodes)
     pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text, share: None)
-    assert reached > 1.02 * score(*pi.build(plant, pi_tuned), episodes)
+    assert reached > 1.03 * score(*pi.build(plant, pi_tuned), episodes)
     exact = mpc.innovations_form(linear_models.fit_arx(records.record(plant, params, KEY, 4), 2, 2))
     for move_weight in (1e-4, 1e-3, 1e-2):
         controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0))
-        assert reached > 1.02 * score(controller, (), episodes)
+        assert reached > 1.03 * score(controller, (), episodes)
 
 
 def test_steps_and_stages_are_counted(tuned):
