@@ -16,7 +16,7 @@ if sys.version_info < (3, 12):  # jaxlib 0.10 logs errors about its own compilat
 
 if TYPE_CHECKING:
     from jaxouter.agents import Agent
-    from jaxouter.library import Run, learn, load, resume
+    from jaxouter.api import Run, learn, load, resume
     from jaxouter.loop.environment import make
     from jaxouter.loop.policy import Policy
     from jaxouter.plants import Plant
@@ -26,11 +26,11 @@ _MODULES = {
     "Agent": "agents",
     "Plant": "plants",
     "Policy": "loop.policy",
-    "Run": "library",
-    "learn": "library",
-    "load": "library",
+    "Run": "api",
+    "learn": "api",
+    "load": "api",
     "make": "loop.environment",
-    "resume": "library",
+    "resume": "api",
 }
 __all__ = ["Agent", "Plant", "Policy", "Run", "__version__", "learn", "load", "make", "resume"]
 

@@ -18,10 +18,10 @@ from rich.text import Text
 from tyro.conf import UseAppendAction
 
 from jaxouter import agents, plants, tasks
+from jaxouter.api.learning import ChoiceWarning
 from jaxouter.evaluation import scenarios, sweeps
 from jaxouter.evaluation.baselines import NAMES
 from jaxouter.identification.steady_state import IdentificationWarning
-from jaxouter.library.learning import ChoiceWarning
 from jaxouter.plants.registry import FORMS, own_errors
 from jaxouter.terminal import console, last, show
 from jaxouter.training.run import RunWarning

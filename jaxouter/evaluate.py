@@ -13,12 +13,12 @@ import numpy as np
 import tyro
 
 from jaxouter import cli, plants
+from jaxouter.api import Run, load
 from jaxouter.evaluation import jobs, policies, scenarios
 from jaxouter.evaluation.baselines import BASELINES
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import number
 from jaxouter.evaluation.policies import Results, result
-from jaxouter.library import Run, load
 from jaxouter.plants.registry import add
 from jaxouter.progress import Progress, showing
 from jaxouter.training.run import write_json

@@ -10,9 +10,9 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli
+from jaxouter.api import Run, load
 from jaxouter.exports import files
 from jaxouter.exports.files import FORMATS
-from jaxouter.library import Run, load
 
 
 @dataclass(frozen=True)

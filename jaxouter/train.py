@@ -15,11 +15,11 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli, plants
+from jaxouter.api.learning import MAIN_FIGURE, Stopped, chosen, training
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import FiguresOfMerit, number
 from jaxouter.evaluation.policies import TrainingSummary
-from jaxouter.library.learning import MAIN_FIGURE, Stopped, chosen, training
 from jaxouter.plants.registry import add
 from jaxouter.progress import showing
 from jaxouter.training.config import TrainConfig, preset, to_dict

@@ -15,7 +15,7 @@ import pytest
 from tensorboardX.proto import event_pb2
 
 from jaxouter import evaluate, train
-from jaxouter.library import learning
+from jaxouter.api import learning
 from jaxouter.plants import REGISTRY
 from jaxouter.training.config import to_dict
 from jaxouter.training.run import RunFolder

@@ -13,11 +13,11 @@ import pytest
 from rich.console import Console
 
 from jaxouter import cli, compare, evaluate, progress, train
+from jaxouter.api import learning as learning_
 from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.evaluation.results import Comparison, PolicyInfo, Row, Summary
-from jaxouter.library import learning as learning_
 from jaxouter.plants import REGISTRY, host
 from jaxouter.progress import Progress, TimeLeft
 from jaxouter.training.config import preset

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from jaxouter import evaluate, plants, train
+from jaxouter.api import learning
 from jaxouter.evaluation import comparison, pace, scenarios
 from jaxouter.evaluation.policies import baseline
 from jaxouter.evaluation.policies import evaluate_on as evaluated
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import records, steady_state
-from jaxouter.library import learning
 from jaxouter.loop.policy import none
 from jaxouter.plants import host
 from jaxouter.progress import showing

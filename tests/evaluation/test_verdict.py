@@ -12,8 +12,8 @@ import msgspec
 import pytest
 
 from jaxouter import plants
+from jaxouter.api import Run
 from jaxouter.evaluation.verdict import Verdict, judge
-from jaxouter.library import Run
 from jaxouter.loop.policy import AffineParams
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import RunFolder

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from jaxouter import check, cli, compare, evaluate, export, live, plants, train
+from jaxouter.api import learning
 from jaxouter.evaluation import jobs
 from jaxouter.evaluation.jobs import Entrant, Job
-from jaxouter.library import learning
 from jaxouter.plants import host, registry, simulate
 from jaxouter.plants.errors import PlantError, said
 from tests.precision import makes_nan

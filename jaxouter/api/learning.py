@@ -16,6 +16,7 @@ import jax
 import msgspec
 import numpy as np
 
+from jaxouter.api.run import Run, load
 from jaxouter.evaluation import figures, pace, scenarios
 from jaxouter.evaluation.baselines import SIMPLE
 from jaxouter.evaluation.cache import use_compilation_cache
@@ -32,7 +33,6 @@ from jaxouter.evaluation.policies import (
 )
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
-from jaxouter.library.run import Run, load
 from jaxouter.loop import rewards
 from jaxouter.plants import Plant, base, make, slug
 from jaxouter.plants.errors import PlantError

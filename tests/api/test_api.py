@@ -16,8 +16,8 @@ import pytest
 
 import jaxouter
 from jaxouter import plants, train
+from jaxouter.api import Stopped, learning
 from jaxouter.evaluation import compare, evaluate, jobs
-from jaxouter.library import Stopped, learning
 from jaxouter.plants import registry
 from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.run import RunFolder
