@@ -173,11 +173,12 @@ def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: M
     figure = Figure(figsize=(10, 3.4 * len(panels) / 2), layout="constrained")
     grid = np.ravel(figure.subplots(len(panels) // 2, 2))
     for axes, letter, (scenario, name, traces) in zip(grid, "abcd", panels, strict=False):
-        title = f"({letter}) {scenario.id}, {name}: MAE {mae(traces):.3g} {symbol(scenario.plant.y_unit)}"
+        short = scenario.id.rpartition("/")[2]  # the plant's name, which may be long, stands above all panels
+        title = f"({letter}) {short}, {name}: MAE {mae(traces):.3g} {symbol(scenario.plant.y_unit)}"
         if heaters and letter == "d":
             _changes(axes, scenario, traces)
             axes.set_ylim(bottom=0)
-            title = f"({letter}) {scenario.id}, {name}: change an hour"
+            title = f"({letter}) {short}, {name}: change an hour"
         else:
             if name == "learned outer loop":
                 _houses(axes, scenario, traces)
@@ -192,6 +193,7 @@ def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: M
                     label="modified reference r̃",
                 )
         _finish(axes, scenario, title)
+    figure.suptitle(scenarios[0].plant.name, fontsize=11)
     return styled(figure)
 
 
