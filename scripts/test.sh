@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Lint, types and tests, in under 9 minutes on 2 cores.
+# Lint, types and tests, in under 9 minutes on 2 cores, set-up aside.
 # --all, under 120 minutes: all tests as users compile, the slow ones too, all others in double precision, all but plants
 # and loop with checks for NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in
 # an environment of its own, the default suite on a second Python, the code blocks of the documentation, and

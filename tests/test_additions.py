@@ -82,6 +82,7 @@ def test_the_commands_know_them_by_their_files(folder, tmp_path, monkeypatch):
     assert ControllerSpec.load(Path("controller.npz")).plant == "Room"
 
 
+@pytest.mark.slow
 def test_compared_and_live(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     named = ["--plant", PLANT, "--agent", LEARNER]

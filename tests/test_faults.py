@@ -36,7 +36,8 @@ def test_three_kills_change_nothing(tmp_path):
     assert len(content["kills"]) == 3
 
 
-@pytest.mark.parametrize("by", [pytest.param("file system", marks=pytest.mark.slow), "limit"])
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["file system", "limit"])
 def test_a_full_disk_ends_the_run_with_one_line_and_leaves_the_last_checkpoint_whole(tmp_path, by):
     """A file system that holds what there is and half a checkpoint more, or a limit of half a checkpoint a file."""
     run = begun(tmp_path / "run")

@@ -60,6 +60,7 @@ def test_static_says_that_it_is_none_also_from_the_cache():
     assert (float(found.slope), float(found.offset)) == (1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_late_plant_is_trained_with_a_history_that_holds_its_dead_time_and_judged(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     train.main([reference("Late"), "--out", "run", *TINY])

@@ -25,6 +25,7 @@ def forgotten():
         yield
 
 
+@pytest.mark.slow
 def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     train.main([TANKS, "--out", "run", *TINY])

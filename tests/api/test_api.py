@@ -169,6 +169,7 @@ def test_mistakes_are_value_errors_that_say_what_is_allowed(given, text, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
     run = jaxouter.learn(TERM, "quick", out=tmp_path / "run", progress=False, reward={"alpha_g": 0.6})
     (row,), reward = run.metrics, run.summary.reward
@@ -197,6 +198,7 @@ def test_a_stopped_run_says_how_to_go_on_and_does(tmp_path, monkeypatch):
     assert "Room(tau=4)/day" in jaxouter.resume(stopped.path, progress=False).summary.results[0].scenarios
 
 
+@pytest.mark.slow
 def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
     """Named nowhere but here; in its place may come another one of its name."""
 

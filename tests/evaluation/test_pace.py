@@ -124,6 +124,7 @@ def test_a_run_that_learned_nothing_leaves_no_folder(capsys, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("slow")
 def test_after_the_training_of_a_slow_plant_there_are_few_episodes(capsys, tmp_path, monkeypatch):
     """As many as are asked for, or as take no longer than learning did."""

@@ -141,7 +141,7 @@ def chromium(request):
         browser.close()
 
 
-@pytest.fixture(params=[1280, 390], ids=["laptop", "phone"])
+@pytest.fixture(params=[pytest.param(1280, id="laptop", marks=pytest.mark.slow), pytest.param(390, id="phone")])
 def page(request, chromium, written):
     """The report, opened; whatever the browser complains about or asks the network for fails the test."""
     context = chromium.new_context(viewport={"width": request.param, "height": 844})

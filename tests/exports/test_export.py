@@ -178,6 +178,7 @@ def test_command_writes_beside_the_run(pitch):
     path.unlink()
 
 
+@pytest.mark.slow
 def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
     with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
         run = trained(registry.add(TANKS), tmp_path).run

@@ -64,6 +64,7 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
         assert reached > 1.03 * score(controller, (), episodes)
 
 
+@pytest.mark.slow
 def test_steps_and_stages_are_counted(tuned):
     assert tuned.settings["gradient_steps"] == 200
     assert tuned.steps == (200 * 16 + steady_state.LEVELS) * 50
@@ -71,6 +72,7 @@ def test_steps_and_stages_are_counted(tuned):
     assert second > 1.1 * first  # returns are negative
 
 
+@pytest.mark.slow
 def test_built_policy_is_the_one_that_was_chosen(tuned, rollout):
     """Its return on the validation episodes is the one written down."""
     policy, params = oracle.build(lag.LAG, tuned)
