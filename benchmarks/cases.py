@@ -28,7 +28,7 @@ import numpy as np
 from jaxouter import plants
 from jaxouter.agents import OffPolicy
 from jaxouter.loop import environment
-from jaxouter.loop.environment import Environment, EnvParams
+from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset, with_options
 from jaxouter.training.devices import EIGEN, Fleet
 from jaxouter.training.off_policy import OffPolicyDriver
@@ -202,7 +202,7 @@ def vector_step(env: Environment) -> Callable[..., Any]:
 
 
 def roll_out(env: Environment, params: EnvParams, environments: int, act: Callable[..., jax.Array], given: Any) -> Job:
-    """Whole environment steps with r~ = act(given, key, obs, r)."""
+    """Whole environment steps with r~ = act(given, key, obs, state)."""
     steps = steps_of(environments)
     key_reset, key = jax.random.split(jax.random.key(0))
     obs, state = jax.vmap(env.reset, (0, None))(jax.random.split(key_reset, environments), params)
@@ -211,7 +211,7 @@ def roll_out(env: Environment, params: EnvParams, environments: int, act: Callab
         def step(carry: Any, _: Any) -> tuple[Any, Any]:
             obs, state, key = carry
             key, key_act, key_env = jax.random.split(key, 3)
-            r_tilde = act(given, key_act, obs, state.r)
+            r_tilde = act(given, key_act, obs, state)
             keys = jax.random.split(key_env, environments)
             obs, state, reward, terminated, truncated, _ = vector_step(env)(keys, state, r_tilde, params)
             return (obs, state, key), (jnp.mean(reward), jnp.any(terminated | truncated))
@@ -226,8 +226,8 @@ def random_roll_out(plant: str, environments: int) -> Job:
     env, params = environment.make(plant)
     low, high = env.plant.r_tilde_bounds
 
-    def act(given: None, key: jax.Array, obs: jax.Array, r: jax.Array) -> jax.Array:
-        return jax.random.uniform(key, r.shape, r.dtype, low, high)
+    def act(given: None, key: jax.Array, obs: jax.Array, state: EnvState) -> jax.Array:
+        return jax.random.uniform(key, state.r.shape, state.r.dtype, low, high)
 
     return roll_out(env, params, environments, act, None)
 
@@ -236,9 +236,10 @@ def policy_roll_out(plant: str, environments: int) -> Job:
     trainer, params = build(preset(plant))
     learned = trainer.policy_params(trainer.fresh(jax.random.key(0), params))
 
-    def act(learned: Any, key: jax.Array, obs: jax.Array, r: jax.Array) -> jax.Array:
+    def act(learned: Any, key: jax.Array, obs: jax.Array, state: EnvState) -> jax.Array:
         action = jax.vmap(trainer.policy.action, (None, 0))(learned.actor, obs)
-        return jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(learned.base, r, action)
+        of_each = jax.vmap(trainer.policy.r_tilde, (None, 0, 0, 0, 0))
+        return of_each(learned.base, state.memory, state.r, state.y_seen, action)
 
     return roll_out(trainer.env, params, environments, act, learned)
 

@@ -31,6 +31,7 @@ SHOWN = (
     "settling_time",
     "steady_state_error",
     "violation_time",
+    "swing",
     "r_tilde_tv",
 )
 

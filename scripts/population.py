@@ -63,7 +63,7 @@ def main() -> None:
         base = steady_state.static(*plants.make("heaters"), jax.random.key(options.seed))[1]  # of four houses
         plant, params = plants.make("heaters", n=options.houses, law=options.law)
         params = spread(params, options.houses, options.devices)
-    r_tilde = jnp.clip(base.offset + base.slope * options.r, *plant.r_tilde_bounds)
+    r_tilde = jnp.clip(base.offset + base.r * options.r, *plant.r_tilde_bounds)
     begun = time.perf_counter()
     compiled = run.lower(plant, params, r_tilde, jax.random.key(options.seed), options.hours).compile()
     compiling = time.perf_counter() - begun

@@ -34,7 +34,8 @@ SMALL += [
     "32",
     "--agent.updates",
     "1",
-    "--no-residual",
+    "--base",
+    "absolute",
 ]
 SMALL += ["--pretraining.gradient-steps", "0"]
 PLACES = {"pitch/paper": "inside"} | {f"pitch/delay-{name}": "outside" for name in ("5.7", "0.57", "swapped")}

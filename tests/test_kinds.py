@@ -57,7 +57,7 @@ def test_static_says_that_it_is_none_also_from_the_cache():
     tuned = BASELINES["static"].tune(plant, params, kinds.key(0), 0, lambda text: None)
     with pytest.warns(IdentificationWarning, match="the static prefilter is r~ = r"):
         _, found = BASELINES["static"].build(plant, tuned)
-    assert (float(found.slope), float(found.offset)) == (1.0, 0.0)
+    assert (float(found.r), float(found.offset)) == (1.0, 0.0)
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def test_it_begins_from_nothing_in_real_time(begun):
     assert summary["counts"]["static"] + summary["counts"]["learned"] > 100
     assert summary["missed_deadlines"] == summary["counts"]["late"]
     assert summary["updates"] > 50
-    assert summary["base"]["slope"] == pytest.approx(1 / 0.7, rel=0.1)
+    assert summary["base"]["r"] == pytest.approx(1 / 0.7, rel=0.1)
     assert 0.0 < summary["act_us"]["p50"] < summary["act_us"]["p99"]
     last = summary["mae"]["last quarter"]
     assert last["y"] < last["y_passed"]

@@ -373,7 +373,7 @@ def test_recording_from_a_simulator_has_a_bar_of_its_own(clock, monkeypatch):
     simulators = SimpleNamespace(speed=SimpleNamespace(steps=1_000))
     monkeypatch.setattr(host, "of", lambda plant: simulators, raising=False)
     config = replace(
-        small("lag", pretraining=preset("pitch").pretraining), residual=True
+        small("lag", pretraining=preset("pitch").pretraining), base="static"
     )  # 64 + 8 episodes of 50 steps
     of, learned = begun(clock, config, lag.LAG)
     learned.begins("recording", 0, 0)

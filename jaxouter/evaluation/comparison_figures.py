@@ -36,6 +36,8 @@ STYLES = {  # after Okabe and Ito, which the colour-blind tell apart; line and m
     "learned": Style("#0b6fb8", "-", "o", 2.6, 5.0),
     "none": Style("#8a8a8a", "-", "X"),
     "static": Style("#c98500", DASHED, "s"),
+    "lq": Style("#b2182b", "-", "^"),
+    "lq-return": Style("#e08a7d", DASHED, "<"),
     "pi": Style("#009e73", DASHDOT, "^"),
     "mpc": Style("#c4548f", "-", "D"),
     "deepc": Style("#d55e00", DASHDOTDOT, "v"),

@@ -45,7 +45,7 @@ from jaxouter.training.run import RunFolder, add_agent
 
 TUNED = ("baseline", "limit")  # kinds of policies that are identified first
 WITHIN = 1e-3  # share of the steps that may lie outside the limits
-SET_POINTS = 5  # of the stability analysis, over the range of evaluation
+SET_POINTS = 19  # of the stability analysis, over the range of evaluation
 LEARNED_NOTE = "The learned outer loop, without exploration."
 TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
 Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run

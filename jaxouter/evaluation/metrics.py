@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -11,12 +11,13 @@ import jax
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType, field
 
-from jaxouter.evaluation.rollout import Traces, excess
+from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import rewards
+from jaxouter.loop.references import held as held_of
 from jaxouter.loop.rewards import RewardConfig, RewardParams
 from jaxouter.plants import Plant
-from jaxouter.plants.base import RUN_ONCE
+from jaxouter.plants.base import RUN_ONCE, excess
 
 BAND = 0.05  # of the step, for the settling time
 ROUNDING = 1e-4  # of the error scale, by which a limit that is just met may be exceeded
@@ -41,6 +42,7 @@ class FiguresOfMerit(Struct, frozen=True, kw_only=True):
     violation_max: float | None = None  # y; largest excess over the limits
     violation_time_each: float | None = None  # share; the same over the plant's single outputs (houses)
     violation_max_each: float | None = None  # y; likewise
+    swing: float | None = None  # y; standard deviation of r~ over the second half of a set-point; the largest of them
     r_tilde_tv: float | None = None  # y; total variation of r~ in an episode
     episode_return: float | None = field(default=None, name="return")  # sum of rewards in an episode
     diverged: bool | UnsetType = UNSET  # only where a trace is not finite
@@ -65,7 +67,8 @@ def mae(traces: Traces) -> float:
 
 def trained_return(traces: Traces, plant: Plant, config: RewardConfig) -> float | None:
     """Sum of the rewards that are trained on in an episode, mean over episodes; None where not finite."""
-    found = np.asarray(_rewards(plant, rewards.params(plant, config), *_moves(traces, plant)))
+    price = rewards.params(plant, config)
+    found = np.asarray(_rewards(plant, price, _moves(traces, plant), jax.vmap(held_of)(traces.r)))
     total = float(found.sum(1).mean())
     return total if np.isfinite(total) else None
 
@@ -89,9 +92,13 @@ def _over_episodes(function: Callable[..., jax.Array]) -> Callable[..., jax.Arra
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-def _rewards(plant: Plant, price: RewardParams, *signals: jax.Array) -> jax.Array:
+def _rewards(plant: Plant, price: RewardParams, signals: Sequence[jax.Array], held: jax.Array) -> jax.Array:
     """Rewards (episodes, T) that are trained on."""
-    return _over_episodes(partial(rewards.reward, price, terms=plant.reward_terms))(*signals)
+
+    def reward(held: jax.Array, *signals: jax.Array) -> jax.Array:
+        return rewards.reward(price, *signals, terms=plant.reward_terms, held=held.astype(signals[0].dtype))
+
+    return _over_episodes(reward)(held, *signals)
 
 
 def held(traces: Traces, plant: Plant) -> float:
@@ -133,9 +140,10 @@ def figures_of_merit(traces: Traces, scenario: Scenario, inner_mae: float | None
 def _of_set_points(traces: Traces, plant: Plant) -> dict[str, Any]:
     """Figures of the held set-points; a set-point at which y already is has no step."""
     no_step = NO_STEP * plant.error_scale
-    segments = [_segment(y_start, r, y, plant.control_step, no_step) for y_start, r, y in _segments(traces)]
-    itae, overshoot, settling, steady = (np.array(column) for column in zip(*segments, strict=True))
+    segments = [_segment(*each, plant.control_step, no_step) for each in _segments(traces)]
+    itae, overshoot, settling, steady, swing = (np.array(column) for column in zip(*segments, strict=True))
     found: dict[str, Any] = {"itae": float(itae.mean()), "steady_state_error": float(steady.mean())}
+    found["swing"] = float(swing.max())
     steps = np.isfinite(overshoot)
     if steps.any():
         median = float(np.median(settling[steps]))
@@ -157,22 +165,24 @@ def _violations(traces: Traces, plant: Plant) -> dict[str, Any]:
     return found
 
 
-def _segments(traces: Traces) -> Iterator[tuple[float, float, np.ndarray]]:
-    """Of each held set-point: y at its start, r, and y (n,) after each of its steps."""
-    for y0, r, y in zip(traces.y0, traces.r, traces.y, strict=True):
+def _segments(traces: Traces) -> Iterator[tuple[float, float, np.ndarray, np.ndarray]]:
+    """Of each held set-point: y at its start, r, and y (n,) after each of its steps and r~ (n,) in them."""
+    for y0, r, y, r_tilde in zip(traces.y0, traces.r, traces.y, traces.r_tilde, strict=True):
         starts = [0, *(np.flatnonzero(np.diff(r)) + 1), len(r)]
         for a, b in pairwise(starts):
-            yield (y0 if a == 0 else y[a - 1]), r[a], y[a:b].astype(np.float64)
+            yield (y0 if a == 0 else y[a - 1]), r[a], y[a:b].astype(np.float64), r_tilde[a:b].astype(np.float64)
 
 
-def _segment(y_start: float, r: float, y: np.ndarray, dt: float, no_step: float) -> tuple[float, float, float, float]:
-    """itae, overshoot (%), settling time and steady-state error of one set-point; nan where there is no step."""
+def _segment(
+    y_start: float, r: float, y: np.ndarray, r_tilde: np.ndarray, dt: float, no_step: float
+) -> tuple[float, float, float, float, float]:
+    """itae, overshoot (%), settling time, steady-state error, swing of one set-point; nan where there is no step."""
     e, step, t = np.abs(r - y), float(r - y_start), dt * np.arange(1, len(y) + 1)
     itae = float((t * e).sum() * dt)
-    steady = float(abs(np.mean(r - y[-max(1, len(y) // 10) :])))
+    steady, swing = float(abs(np.mean(r - y[-max(1, len(y) // 10) :]))), float(np.std(r_tilde[len(y) // 2 :]))
     if abs(step) < no_step:
-        return itae, np.nan, np.nan, steady
+        return itae, np.nan, np.nan, steady, swing
     overshoot = 100.0 * max(0.0, float(np.max((y - r) * np.sign(step)))) / abs(step)
     outside = np.flatnonzero(e > BAND * abs(step))
     settled = 0.0 if len(outside) == 0 else np.inf if outside[-1] == len(y) - 1 else float(t[outside[-1]])
-    return itae, overshoot, settled, steady
+    return itae, overshoot, settled, steady, swing

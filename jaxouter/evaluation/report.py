@@ -119,6 +119,7 @@ def merits(y_unit: str, time_unit: str) -> list[Merit]:
         Merit("steady_state_error", "steady-state error", y, "|mean of r − y| over the last tenth of a set-point"),
         Merit("violation_time", "violation time", "share", "share of steps outside the limits of y or of its change"),
         Merit("violation_max", "largest violation", y, "largest excess over the limits"),
+        Merit("swing", "swing", y, "standard deviation of r̃ over the second half of a set-point; the largest of them"),
         Merit("r_tilde_tv", "variation of r̃", y, "sum of |r̃ₖ − r̃ₖ₋₁| over an episode, the first move included"),
         Merit("episode_return", "return", "", "sum of the rewards of an episode"),
     ]

@@ -19,7 +19,7 @@ from jaxouter.loop.policy import Policy
 from jaxouter.loop.rewards import RewardParams
 from jaxouter.loop.sensor import SensorParams
 from jaxouter.plants import Plant, host
-from jaxouter.plants.base import parameters
+from jaxouter.plants.base import excess, parameters
 
 
 class Traces(NamedTuple):
@@ -49,17 +49,6 @@ def _axes(inputs: _Inputs) -> Any:
     each = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, inputs.sensor)
     axes: Any = (0, None if inputs.change is None else (None, 0), each, None)
     return _Inputs(*axes)
-
-
-def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike) -> jax.Array:
-    """By how much y (any shape) is outside the plant's limits; at most 0 where inside."""
-    y, y_before = jnp.asarray(y), jnp.asarray(y_before)
-    over = jnp.full_like(y, -jnp.inf)
-    if plant.output_limit is not None:
-        over = jnp.maximum(over, jnp.abs(y) - plant.output_limit)
-    if plant.rate_limit is not None:
-        over = jnp.maximum(over, jnp.abs(y - y_before) - plant.rate_limit)
-    return over
 
 
 def _begin(plant: Plant, inputs: _Inputs, key: chex.PRNGKey) -> LoopState:

@@ -18,6 +18,9 @@ from jaxouter.plants import Plant, Ranges, base, make, parameters
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
+REST_POINTS = 19  # set-points at which it is seen whether the loop comes to rest
+REST_STEPS = 1_200  # for which each is held
+REST = {"rest": 0.0, "rest-noise": 0.006}  # standard deviation of their sensor, as share of the range of set-points
 NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
 Place = Literal["inside", "edge", "outside"]
@@ -96,15 +99,28 @@ def _family(name: str, kind: str, family_seed: int) -> Builder:
     return build
 
 
+def _rest(name: str, kind: str, noise: float) -> Builder:
+    """Set-points over the range of evaluation, long held, on the plant without its own disturbance."""
+
+    def build(wanted: int | None) -> Scenario:
+        n, (plant, params) = wanted or REST_POINTS, make(name)
+        r = jnp.linspace(*plant.evaluation_range, n)[:, None]
+        made = _scenario(kind, plant, plant.noise_free(params), jnp.broadcast_to(r, (n, REST_STEPS)), n)
+        return replace(made, sensor=sensors.params(noise=noise * float(np.ptp(plant.setpoint_range))))
+
+    return build
+
+
 def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Builder]:
     """Every scenario of a plant: id -> function of the number of episodes (None: its own number).
 
-    They are those that its task declares, and the families that the plant does.
+    They are those that its task declares, the families that the plant does, and long held set-points.
     """
     plant, _ = make(name)
     own = {key: _declared(name, key, spec) for key, spec in tasks.of(name).scenarios.items()}
     families = {kind: _family(name, kind, family_seed) for kind in plant.families}
-    return {f"{name}/{key}": build for key, build in (own | families).items()}
+    rest = {key: _rest(name, key, noise) for key, noise in REST.items()}
+    return {f"{name}/{key}": build for key, build in (own | families | rest).items()}
 
 
 def plant_of(identifier: str) -> str:
@@ -217,7 +233,8 @@ def _numbers(params: Any, start: Sequence[str]) -> dict[str, np.ndarray]:
 
 def reported(name: str) -> list[str]:
     """Ids of the scenarios on which a training of the plant is evaluated: of the paper's plants those in the paper."""
-    return [f"{name}/{key}" for key in tasks.of(name).reported] or list(catalogue(name))
+    own = [f"{name}/{key}" for key in tasks.of(name).reported]
+    return own or [identifier for identifier in catalogue(name) if identifier.rpartition("/")[2] not in REST]
 
 
 def for_stability(name: str) -> list[str]:

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
@@ -37,7 +37,7 @@ def judge(
     key: chex.PRNGKey,
     policy: LearnedPolicy,
     learned: Mapping[int, LearnedParams],
-    simple: Mapping[str, AffineParams],
+    simple: Mapping[str, LinearLaw],
 ) -> Verdict:
     """MAE of the learned policies, by seed, and of affine ones, by name, on fresh training episodes.
 

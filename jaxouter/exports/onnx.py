@@ -1,7 +1,7 @@
 """The controller as an ONNX graph; needs the extra `onnx`.
 
-    inputs   r (), y (), y_past (H,), r_tilde_past (H,), integral ()
-    outputs  r_tilde (), y_past_next (H,), r_tilde_past_next (H,), integral_next ()
+    inputs   r (), y (), y_past (M,), r_tilde_past (M,), integral ()
+    outputs  r_tilde (), y_past_next (M,), r_tilde_past_next (M,), integral_next ()
 
 All are float32. The graph has no memory: feed each output `..._next` back in at the next control step. The model's
 metadata give the initial values, units and bounds.
@@ -51,14 +51,13 @@ def model(spec: ControllerSpec) -> onnx.ModelProto:
     observation = _observation(graph, spec)
     action = _network(graph, spec, observation)
     low, high = spec.r_tilde_bounds
-    scaled = graph.add("Mul", "action_scaled", action, graph.constant("r_tilde_half", (high - low) / 2))
-    slope, offset = graph.constant("slope", spec.slope), graph.constant("offset", spec.offset)
-    base = graph.add("Add", "base", graph.add("Mul", "slope_r", slope, "r"), offset)
+    scaled = graph.add("Mul", "action_scaled", action, graph.constant("scale", spec.scale))
+    base = _base(graph, spec)
     unclipped = graph.add("Add", "r_tilde_unclipped", base, scaled)
     bounds = graph.constant("r_tilde_min", low), graph.constant("r_tilde_max", high)
     graph.add("Clip", "r_tilde", unclipped, *bounds)
     _remember(graph)
-    past, y = [spec.history], spec.y_unit
+    past, y = [spec.remembered], spec.y_unit
     made = helper.make_graph(
         graph.nodes,
         f"{spec.plant} outer loop",
@@ -115,12 +114,35 @@ def _observation(graph: _Graph, spec: ControllerSpec) -> str:
     above = graph.add("Sub", "r_above_middle", "r", graph.constant("y_middle", spec.y_middle))
     axis = graph.constant("first_axis", [0], np.int64)
     present = [graph.add("Unsqueeze", f"{name}_1", name, axis) for name in (above, error, integral)]
-    past = graph.add("Sub", "y_past_minus_y", "y_past", "y")
+    past = graph.add("Sub", "y_past_minus_y", _newest(graph, "observed", "y_past", spec.history), "y")
     of_y = graph.add("Concat", "of_y", *present, past, axis=0)
     of_y = graph.add("Div", "of_y_scaled", of_y, graph.constant("y_scale", spec.y_scale))
-    around = graph.add("Sub", "of_r_tilde", "r_tilde_past", graph.constant("r_tilde_middle", (low + high) / 2))
+    newest = _newest(graph, "observed", "r_tilde_past", spec.history)
+    around = graph.add("Sub", "of_r_tilde", newest, graph.constant("r_tilde_middle", (low + high) / 2))
     of_r_tilde = graph.add("Div", "of_r_tilde_scaled", around, graph.constant("r_tilde_scale", (high - low) / 2))
     return graph.add("Concat", "observation", of_y, of_r_tilde, axis=0)
+
+
+def _base(graph: _Graph, spec: ControllerSpec) -> str:
+    """The base law, a scalar."""
+    law = graph.add("Mul", "of_r", graph.constant("base_r", spec.base_r), "r")
+    law = graph.add("Add", "base_of_r", law, graph.constant("base_offset", spec.base_offset))
+    if not spec.lags:
+        return law
+    law = graph.add("Add", "base_of_r_y", law, graph.add("Mul", "of_y_now", graph.constant("base_y", spec.base_y), "y"))
+    moved = graph.add("Sub", "base_y_past_minus_y", _newest(graph, "base", "y_past", spec.lags), "y")
+    applied = _newest(graph, "base", "r_tilde_past", spec.lags)
+    for name, past in (("base_y_past", moved), ("base_r_tilde_past", applied)):
+        product = graph.add("MatMul", f"of_{name}", past, graph.constant(name, getattr(spec, name)))
+        law = graph.add("Add", f"base_with_{name}", law, product)
+    return law
+
+
+def _newest(graph: _Graph, use: str, past: str, samples: int) -> str:
+    """The newest samples of y_past or r_tilde_past, for the base law or for the observation."""
+    name = f"{use}_{past}_newest"
+    begin, end = (graph.constant(f"{name}_{i}", [i], np.int64) for i in (0, samples))
+    return graph.add("Slice", name, past, begin, end)
 
 
 def _network(graph: _Graph, spec: ControllerSpec, x: str) -> str:

@@ -3,7 +3,7 @@
     act = jax.export.deserialize(bytearray(path.read_bytes())).call
     r_tilde, y_past, r_tilde_past, integral = act(r, y, y_past, r_tilde_past, integral)
 
-All are float32. Before the first step y_past (H,) is filled with the first y, r_tilde_past (H,) with that y clipped to
+All are float32. Before the first step y_past (M,) is filled with the first y, r_tilde_past (H,) with that y clipped to
 the bounds of r~, and integral is 0.
 """
 
@@ -37,7 +37,7 @@ def exported(policy: LearnedPolicy, params: LearnedParams) -> export.Exported:
         return r_tilde, memory.y_past, memory.r_tilde_past, memory.integral
 
     number = jax.ShapeDtypeStruct((), np.float32)
-    past = jax.ShapeDtypeStruct((policy.observer.history,), np.float32)
+    past = jax.ShapeDtypeStruct((policy.observer.remembered,), np.float32)
     with jax.default_matmul_precision("highest"):  # else GPUs and TPUs round the inputs of matrix products
         return export.export(jax.jit(outer_loop), platforms=PLATFORMS)(number, number, past, past, number)
 

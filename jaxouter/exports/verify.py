@@ -167,7 +167,7 @@ class StablehloController:
 
 def _struct(spec: ControllerSpec) -> type[ctypes.Structure]:
     """The state of the C code."""
-    past = ctypes.c_float * spec.history
+    past = ctypes.c_float * spec.remembered
 
     class Struct(ctypes.Structure):
         _fields_ = [("y_past", past), ("r_tilde_past", past), ("integral", ctypes.c_float)]

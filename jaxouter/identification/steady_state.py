@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxouter.loop.policy import Affine, AffineParams, none
+from jaxouter.loop.policy import Linear, LinearLaw, affine, none
 from jaxouter.plants import Plant, host, simulate
 from jaxouter.plants.base import RUN_ONCE
 
@@ -236,7 +236,7 @@ def _together(plant: Plant, steps: int, params: Any, key: chex.PRNGKey, levels: 
     return jax.vmap(episode)(jnp.asarray(levels))
 
 
-def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, AffineParams]:
+def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Linear, LinearLaw]:
     """The static prefilter: the inverse of the identified affine DC gain, r~ = (r - offset) / gain.
 
     If y does not settle it is r~ = r, with a warning.
@@ -246,11 +246,11 @@ def static(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Affine, Affine
     return prefilter(plant, identified)
 
 
-def prefilter(plant: Plant, identified: DcGain) -> tuple[Affine, AffineParams]:
+def prefilter(plant: Plant, identified: DcGain) -> tuple[Linear, LinearLaw]:
     """The inverse of the DC gain; r~ = r if there is none."""
     if identified.unsettled is not None:
         return none(plant)
-    return Affine(plant.r_tilde_bounds), AffineParams(1.0 / identified.gain, -identified.offset / identified.gain)
+    return Linear(plant.r_tilde_bounds), affine(1.0 / identified.gain, -identified.offset / identified.gain)
 
 
 def warn_unsettled(unsettled: str | None) -> None:

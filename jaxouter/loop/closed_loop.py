@@ -63,6 +63,7 @@ def advance(
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
     terms: tuple[Term, ...] = (),
+    held: jax.Array | float = 0.0,
 ) -> tuple[LoopState, jax.Array, Any]:
     """One control step under r~ (scalar), clipped to its bounds.
 
@@ -75,6 +76,7 @@ def advance(
         measure, treat: see `Measure` and `Treat`.
         load: disturbance that is added to r~ at the plant; neither reward nor observation sees it.
         terms: of the reward, beside the paper's.
+        held: control steps since r last changed, which the reward may depend on.
 
     Returns:
         The state at t_(k+1), the reward on the true outputs, and the result of `treat`.
@@ -82,7 +84,7 @@ def advance(
     r_tilde = jnp.clip(r_tilde, *plant.r_tilde_bounds)
     plant_state = plant.step(params, state.plant, r_tilde + load, key)
     y, found = treat(r_tilde, plant.output(params, plant_state))
-    reward = rewards.reward(price, r, y, state.y, r_tilde, state.r_tilde, terms)
+    reward = rewards.reward(price, r, y, state.y, r_tilde, state.r_tilde, terms, held)
     return LoopState(plant_state, y, measure(y, state.y_seen), r_tilde), reward, found
 
 
@@ -101,6 +103,7 @@ def step(
     treat: Treat = as_it_is,
     load: jax.Array | float = 0.0,
     terms: tuple[Term, ...] = (),
+    held: jax.Array | float = 0.0,
 ) -> tuple[LoopState, Any, jax.Array, Any]:
     """One control step under a JAX policy with its memory (carry); otherwise like `advance`.
 
@@ -108,5 +111,5 @@ def step(
         The state at t_(k+1), the memory, the reward, and the result of `treat`.
     """
     memory, r_tilde = policy.act(policy_params, memory, r, state.y_seen, key_policy)
-    state, reward, found = advance(plant, params, price, state, r, r_tilde, key, measure, treat, load, terms)
+    state, reward, found = advance(plant, params, price, state, r, r_tilde, key, measure, treat, load, terms, held)
     return state, memory, reward, found

@@ -55,6 +55,7 @@ class EnvState(NamedTuple):
     y: jax.Array  # true output y_k
     y_seen: jax.Array  # measured output
     k: jax.Array  # int32, k
+    held: jax.Array  # int32, control steps since r last changed
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Environment:
         loop = closed_loop.begin(self.plant, plant_params, state, partial(sensor.measure, params.sensor, key_sensor))
         goal, r = self.goal.init(key_goal, loop.y_seen)
         memory, obs = self.observer.observe(self.observer.init(r, loop.y_seen), r, loop.y_seen)
-        return obs, EnvState(state, drawn, goal, memory, r, loop.y, loop.y_seen, jnp.zeros((), jnp.int32))
+        return obs, EnvState(state, drawn, goal, memory, r, loop.y, loop.y_seen, *jnp.zeros(2, jnp.int32))
 
     def _bounded(self, r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Clip an output that has diverged (NaN included) to the bounds; the flag ends the episode."""
@@ -138,7 +139,17 @@ class Environment:
         loop = LoopState(state.plant, state.y, state.y_seen, before)
         measure = partial(sensor.measure, params.sensor, key)
         loop, reward, terminated = closed_loop.advance(
-            plant, p, params.reward, loop, state.r, action, key, measure, self._bounded, terms=plant.reward_terms
+            plant,
+            p,
+            params.reward,
+            loop,
+            state.r,
+            action,
+            key,
+            measure,
+            self._bounded,
+            terms=plant.reward_terms,
+            held=state.held.astype(state.y.dtype),
         )
         reward = reward + jnp.where(terminated, params.reward.divergence, 0.0)
         truncated = state.k + 1 >= plant.episode_steps
@@ -146,7 +157,8 @@ class Environment:
         goal, r = self.goal.step(state.goal, loop.y_seen)
         memory = self.observer.record(state.memory, state.y_seen, loop.r_tilde)
         memory, obs = self.observer.observe(memory, r, loop.y_seen)
-        state = EnvState(loop.plant, state.plant_params, goal, memory, r, loop.y, loop.y_seen, state.k + 1)
+        held = jnp.where(r == state.r, state.held + 1, 0)
+        state = EnvState(loop.plant, state.plant_params, goal, memory, r, loop.y, loop.y_seen, state.k + 1, held)
         return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": loop.y_seen}
 
     def step(

@@ -13,6 +13,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxouter.loop.policy import Past
 from jaxouter.plants import Plant
 
 HISTORY = 15  # past samples by default
@@ -21,8 +22,8 @@ HISTORY = 15  # past samples by default
 class Memory(NamedTuple):
     """Memory of the outer loop between two control steps."""
 
-    y_past: jax.Array  # (H,), y_(k-1), y_(k-2), ...
-    r_tilde_past: jax.Array  # (H,), r~_(k-1), r~_(k-2), ...
+    y_past: jax.Array  # (M,), y_(k-1), y_(k-2), ...; M >= H
+    r_tilde_past: jax.Array  # (M,), r~_(k-1), r~_(k-2), ...
     integral: jax.Array  # leaky integral of r - y, a running mean over `integral_time`
 
 
@@ -49,15 +50,20 @@ class Observer:
     y_middle: float
     y_scale: float
     r_tilde_bounds: tuple[float, float]
+    lags: int = 0
+    """Past samples that the base law needs in the memory."""
 
     @classmethod
-    def of(cls, plant: Plant, history: int | None = None, integral_steps: float | None = None) -> Observer:
+    def of(
+        cls, plant: Plant, history: int | None = None, integral_steps: float | None = None, lags: int = 0
+    ) -> Observer:
         """The observer of a plant.
 
         Args:
             plant: gives the scaling.
             history: None: as the plant declares, or 15.
             integral_steps: None: a quarter of an episode.
+            lags: past samples that the base law needs.
 
         Raises:
             ValueError: history below 1 or integral_steps below 1.
@@ -67,7 +73,12 @@ class Observer:
         if history < 1 or integral_steps < 1:
             raise ValueError(f"history is {history} and integral_steps is {integral_steps}; both must be at least 1")
         low, high = plant.setpoint_range
-        return cls(history, integral_steps, (low + high) / 2, (high - low) / 2, plant.r_tilde_bounds)
+        return cls(history, integral_steps, (low + high) / 2, (high - low) / 2, plant.r_tilde_bounds, lags)
+
+    @property
+    def remembered(self) -> int:
+        """M, past samples in the memory, of which the newest H are observed."""
+        return max(self.history, self.lags)
 
     @property
     def size(self) -> int:
@@ -77,8 +88,7 @@ class Observer:
     def init(self, r0: jax.Array, y0: jax.Array) -> Memory:
         """Memory before t_0: histories filled with y_0 and r~_(-1), which is y_0 clipped to the bounds of r~."""
         del r0  # only the present r is seen
-        before = jnp.clip(y0, *self.r_tilde_bounds)
-        return Memory(jnp.full(self.history, y0), jnp.full(self.history, before), jnp.zeros_like(y0))
+        return Memory(*Past.of(y0, self.remembered, self.r_tilde_bounds), jnp.zeros_like(y0))
 
     def observe(self, memory: Memory, r: jax.Array, y: jax.Array) -> tuple[Memory, jax.Array]:
         """At t_k: memory with r_k - y_k integrated, and the observation (3 + 2H,)."""
@@ -87,22 +97,19 @@ class Observer:
 
     def record(self, memory: Memory, y: jax.Array, r_tilde: jax.Array) -> Memory:
         """After r~_k is chosen: y_k and r~_k enter the past."""
-        return memory._replace(
-            y_past=jnp.concatenate([y[None], memory.y_past[:-1]]),
-            r_tilde_past=jnp.concatenate([r_tilde[None], memory.r_tilde_past[:-1]]),
-        )
+        return Memory(*Past(memory.y_past, memory.r_tilde_past).then(y, r_tilde), memory.integral)
 
     def features(self, memory: Memory, r: jax.Array, y: jax.Array) -> jax.Array:
         """[r, r - y, leaky integral, past y minus y, past r~], scaled; (3 + 2H,)."""
         chex.assert_rank([r, y], 0)
         low, high = self.r_tilde_bounds
         present = jnp.stack([r - self.y_middle, r - y, memory.integral]) / self.y_scale
-        y_past = (memory.y_past - y) / self.y_scale
-        r_tilde_past = (memory.r_tilde_past - (low + high) / 2) / ((high - low) / 2)
+        y_past = (memory.y_past[: self.history] - y) / self.y_scale
+        r_tilde_past = (memory.r_tilde_past[: self.history] - (low + high) / 2) / ((high - low) / 2)
         return jnp.concatenate([present, y_past, r_tilde_past])
 
     def memory_at(self, window: Signals, i: jax.Array | int) -> Memory:
-        """Memory at t_i (its error integrated) from a window that starts at least H steps before step i.
+        """The newest H of the memory at t_i (its error integrated), from a window that starts H steps earlier or more.
 
         Args:
             window: Signals of W consecutive steps of one environment; there may be a reset among those before i.

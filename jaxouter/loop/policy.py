@@ -1,4 +1,4 @@
-"""The policy protocol, and the two simplest policies."""
+"""The policy protocol, and policies that are linear: base laws."""
 
 from __future__ import annotations
 
@@ -35,33 +35,77 @@ class Policy(Protocol):
         ...
 
 
-class AffineParams(NamedTuple):
-    """r~ = offset + slope * r."""
+class LinearLaw(NamedTuple):
+    """A base law: r~, before it is clipped, linear in r, y and the last n of both y and r~.
 
-    slope: jax.Array
+    r~_k = offset + r r_k + y y_k + sum over i from 1 to n of y_past_i (y_(k-i) - y_k) + r_tilde_past_i r~_(k-i)
+    """
+
     offset: jax.Array
+    r: jax.Array
+    y: jax.Array
+    y_past: jax.Array  # (n,), newest first
+    r_tilde_past: jax.Array  # (n,), newest first
+
+
+class Past(NamedTuple):
+    """The last n of both y and r~."""
+
+    y_past: jax.Array  # (n,), y_(k-1), y_(k-2), ...
+    r_tilde_past: jax.Array  # (n,), r~_(k-1), r~_(k-2), ...
+
+    @classmethod
+    def of(cls, y0: jax.Array, lags: int, r_tilde_bounds: tuple[float, float]) -> Past:
+        """The past of a loop at rest at y_0: r~ was y_0, clipped to its bounds."""
+        return cls(jnp.full(lags, y0), jnp.full(lags, jnp.clip(y0, *r_tilde_bounds)))
+
+    def then(self, y: jax.Array, r_tilde: jax.Array) -> Past:
+        """The past one control step later."""
+        pushed = ((y, self.y_past), (r_tilde, self.r_tilde_past))
+        return Past(*(jnp.concatenate([new[None], old])[: len(old)] for new, old in pushed))
+
+
+def affine(slope: Any, offset: Any, lags: int = 0) -> LinearLaw:
+    """r~ = offset + slope r. Slope 1 is the inner loop alone, slope 1 / gain the static prefilter."""
+    nothing = jnp.zeros(lags)
+    return LinearLaw(jnp.asarray(offset, float), jnp.asarray(slope, float), jnp.zeros(()), nothing, nothing)
+
+
+def padded(law: LinearLaw, lags: int) -> LinearLaw:
+    """The same law in JAX numbers, with zeros for further lags."""
+    offset, r, y, *pasts = (jnp.asarray(each, float) for each in law)
+    return LinearLaw(offset, r, y, *(jnp.pad(each, (0, lags - len(each))) for each in pasts))
+
+
+def unclipped(law: LinearLaw, past: Any, r: jax.Array, y: jax.Array) -> jax.Array:
+    """r~ of a base law before it is clipped; `past` is a `Past`, or a `Memory`, of n samples or more."""
+    n, r_tilde = law.y_past.shape[0], law.offset + law.r * r
+    if not n:
+        return r_tilde
+    return r_tilde + law.y * y + law.y_past @ (past.y_past[:n] - y) + law.r_tilde_past @ past.r_tilde_past[:n]
 
 
 @dataclass(frozen=True)
-class Affine:
-    """r~ = offset + slope r, clipped. Slope 1 is the inner loop alone, slope 1 / gain the static prefilter."""
+class Linear:
+    """A base law as a policy; its past holds what was applied."""
 
     r_tilde_bounds: tuple[float, float]
     host: bool = False
 
-    def init(self, params: AffineParams, r0: jax.Array, y0: jax.Array) -> tuple[()]:
-        """Nothing to remember."""
-        del params, r0, y0
-        return ()
+    def init(self, params: LinearLaw, r0: jax.Array, y0: jax.Array) -> Past:
+        """As if the loop were at rest at y_0."""
+        del r0
+        return Past.of(y0, params.y_past.shape[0], self.r_tilde_bounds)
 
     def act(
-        self, params: AffineParams, carry: tuple[()], r: jax.Array, y: jax.Array, key: chex.PRNGKey | None = None
-    ) -> tuple[tuple[()], jax.Array]:
-        """The affine map."""
-        del y, key
-        return carry, jnp.clip(params.offset + params.slope * r, *self.r_tilde_bounds)
+        self, params: LinearLaw, carry: Past, r: jax.Array, y: jax.Array, key: chex.PRNGKey | None = None
+    ) -> tuple[Past, jax.Array]:
+        """The law, clipped."""
+        del key
+        r_tilde = jnp.clip(unclipped(params, carry, r, y), *self.r_tilde_bounds)
+        return carry.then(y, r_tilde), r_tilde
 
 
-def none(plant: Plant) -> tuple[Affine, AffineParams]:
+def none(plant: Plant) -> tuple[Linear, LinearLaw]:
     """The inner loop alone: r~ = r."""
-    return Affine(plant.r_tilde_bounds), AffineParams(jnp.ones(()), jnp.zeros(()))
+    return Linear(plant.r_tilde_bounds), affine(1.0, 0.0)

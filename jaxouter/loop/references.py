@@ -73,6 +73,12 @@ def redrawn(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array
     return jnp.stack([first, telegraph(key_run, steps, low, high, rate), reflected, wandering])[kind]
 
 
+def held(r: jax.Array) -> jax.Array:
+    """Control steps since r (T,) last changed, at each step; int (T,)."""
+    k = jnp.arange(len(r))
+    return k - jax.lax.cummax(jnp.where(r != jnp.roll(r, 1), k, 0))
+
+
 def staircase(key: chex.PRNGKey, steps: int, low: float, high: float) -> jax.Array:
     """Five set-points, each held equally long."""
     levels = jax.random.uniform(key, (SEGMENTS,), float, low, high)

@@ -41,6 +41,13 @@ class RewardConfig:
     """B: price of leaving the limits on y and on its rate."""
     divergence: float = -50.0
     """Reward at the end of an episode that diverged, in error scales of the plant."""
+    huber: float = 0.0
+    """G: errors below this share of the set-point range count by their square, larger ones less half of it; 0: none.
+    Without it |r - y| has a kink at rest, about which the loop swings."""
+    rest: float = 0.0
+    """H: price of a move d below rho_h while r rests, times d^2 / rho_h; 0: none. Else such moves are free."""
+    rest_after: int = 30
+    """H: control steps after which an unchanged r rests."""
     terms: float = 1.0
     """Weight of the terms that the plant declares."""
 
@@ -69,11 +76,15 @@ class RewardParams:
     output_limit: jax.Array  # on |y|
     rate_limit: jax.Array  # on a move of y
     divergence: jax.Array  # added when an episode ends by divergence
+    huber: jax.Array | None  # width about zero in which the error is squared
+    rest: jax.Array | None  # price of small moves of r~ while r rests
+    rest_after: jax.Array  # control steps after which it does
     terms: jax.Array  # weight of the plant's own terms
 
 
 def params(plant: Plant, config: RewardConfig = PAPER) -> RewardParams:
     """The configured constants, with the plant's declared thresholds and limits."""
+    low, high = plant.setpoint_range
 
     def declared(value: float | None) -> jax.Array:
         return jnp.asarray(jnp.inf if value is None else value, float)
@@ -88,6 +99,9 @@ def params(plant: Plant, config: RewardConfig = PAPER) -> RewardParams:
         output_limit=declared(plant.output_limit),
         rate_limit=declared(plant.rate_limit),
         divergence=declared(config.divergence * plant.error_scale),
+        huber=declared(config.huber * (high - low)) if config.huber else None,
+        rest=declared(config.rest) if config.rest else None,
+        rest_after=declared(config.rest_after),
         terms=declared(config.terms),
     )
 
@@ -95,6 +109,17 @@ def params(plant: Plant, config: RewardConfig = PAPER) -> RewardParams:
 def tracking(e: jax.Array, alpha: jax.Array) -> jax.Array:
     """G: the error e >= 0, priced linearly."""
     return -alpha * e
+
+
+def rounded(e: jax.Array, width: jax.Array) -> jax.Array:
+    """Huber's function of the error e >= 0, less half of the width above it (Huber 1964)."""
+    small = jnp.minimum(e, width)
+    return small * (e - small / 2) / width
+
+
+def at_rest(delta: jax.Array, beta: jax.Array, rho: jax.Array) -> jax.Array:
+    """A move delta >= 0 below rho while r rests: priced by its square, and at rho like a larger one."""
+    return jnp.where(delta < rho, -beta * delta * (delta / jnp.where(rho > 0.0, rho, 1.0)), 0.0)
 
 
 def moves(delta: jax.Array, beta: jax.Array, rho: jax.Array) -> jax.Array:
@@ -115,6 +140,7 @@ def reward(
     r_tilde: jax.Array,
     r_tilde_before: jax.Array,
     terms: tuple[Term, ...] = (),
+    held: jax.Array | float = 0.0,
 ) -> jax.Array:
     """R of one control step, scalar.
 
@@ -124,16 +150,19 @@ def reward(
         y, y_before: outputs at t_(k+1) and t_k.
         r_tilde, r_tilde_before: modified references at t_k and t_(k-1).
         terms: functions to add, of the same signals.
+        held: control steps since r last changed, at t_k.
 
     Source: paper eq. 1 and 7, B of sections III and IV.
     """
-    delta_y = jnp.abs(y - y_before)
+    e, delta, delta_y = jnp.abs(r - y), jnp.abs(r_tilde - r_tilde_before), jnp.abs(y - y_before)
     of_paper = (
-        tracking(jnp.abs(r - y), p.alpha_g)
-        + moves(jnp.abs(r_tilde - r_tilde_before), p.beta_h, p.rho_h)
+        tracking(e if p.huber is None else rounded(e, p.huber), p.alpha_g)
+        + moves(delta, p.beta_h, p.rho_h)
         + moves(delta_y, p.beta_b, p.rho_b)
         + excess(jnp.abs(y), p.output_limit, p.delta_b)
         + excess(delta_y, p.rate_limit, p.delta_b)
     )
     own = [p.terms * term(r, y, y_before, r_tilde, r_tilde_before) for term in terms]
+    if p.rest is not None:
+        own.append(jnp.where(held >= p.rest_after, at_rest(delta, p.rest, p.rho_h), 0.0))
     return sum(own, of_paper)

@@ -191,3 +191,14 @@ def array(name: str, value: Any, *shapes: tuple[int, ...]) -> jax.Array:
     if out.shape not in shapes:
         raise ValueError(f"{name} has shape {out.shape}; it must be {allowed}")
     return out
+
+
+def excess(plant: Plant, y: jax.typing.ArrayLike, y_before: jax.typing.ArrayLike) -> jax.Array:
+    """By how much y (any shape) is outside the plant's limits; at most 0 where inside."""
+    y, y_before = jnp.asarray(y), jnp.asarray(y_before)
+    over = jnp.full_like(y, -jnp.inf)
+    if plant.output_limit is not None:
+        over = jnp.maximum(over, jnp.abs(y) - plant.output_limit)
+    if plant.rate_limit is not None:
+        over = jnp.maximum(over, jnp.abs(y - y_before) - plant.rate_limit)
+    return over

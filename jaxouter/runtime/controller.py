@@ -281,7 +281,7 @@ class Controller:
         elapsed = self._watch.elapsed
         if elapsed is None or elapsed < 1.5 or self._transfer.r_tilde is None:
             return
-        for _ in range(round(min(elapsed, self.spec.history + 1)) - 1):
+        for _ in range(round(min(elapsed, self.spec.remembered + 1)) - 1):
             self._memory = self.spec.observe(self._memory, r, y)
             self._memory = self.spec.record(self._memory, y, self._transfer.r_tilde)
 

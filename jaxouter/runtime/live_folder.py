@@ -156,7 +156,8 @@ class LiveFolder:
         if state.begun:
             live = loop.live
             actor = live.agent.actor(state.agent) if state.leads else state.kept
-            spec = ControllerSpec.of(live.policy, LearnedParams(actor, state.base), live.env.plant)
+            policy, params = live.policy.trimmed(LearnedParams(actor, state.base))
+            spec = ControllerSpec.of(policy, params, live.env.plant)
             spec.save(self.path / "controller.npz")
 
 
@@ -240,7 +241,7 @@ def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     `act_us` and `sent_back` are since the start of this process.
     """
     p50, p99 = np.percentile(1e6 * np.asarray(loop.act_seconds), (50, 99)).tolist()
-    slope, offset = (float(value) for value in loop.state.base)
+    law = loop.state.base
     return {
         "format": FORMAT,
         "steps": loop.steps,
@@ -249,7 +250,7 @@ def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "updates": loop.updates,
         "sent_back": loop.sent_back,
         "act_us": {"p50": p50, "p99": p99},
-        "base": {"slope": slope, "offset": offset},
+        "base": {name: np.asarray(value).tolist() for name, value in law._asdict().items()},
         "mae": {part: maes(columns, quarters) for part, quarters in PARTS.items()},
     }
 

@@ -28,7 +28,7 @@ from jaxouter.identification.records import Record
 from jaxouter.loop import rewards
 from jaxouter.loop.environment import Environment
 from jaxouter.loop.observation import Memory, Observer, Signals
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw, affine, unclipped
 from jaxouter.loop.references import SetPoint
 from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import arx
@@ -65,6 +65,7 @@ class Sample(NamedTuple):
     y: jax.Array
     r_tilde: jax.Array
     age: jax.Array  # int32, control steps since the last interruption
+    held: jax.Array  # int32, control steps since r last changed
 
 
 class Response(NamedTuple):
@@ -88,7 +89,7 @@ class LiveState(NamedTuple):
 
     agent: Any
     replay: ReplayState
-    base: AffineParams  # r~ of a zero action
+    base: LinearLaw  # r~ of a zero action
     kept: Any  # fallback actor, from the start; if it is zero, the fallback is the static inverse
     begun: jax.Array  # bool, whether a base law is known (else r~ = r)
     leads: jax.Array  # bool, whether the learned policy acts
@@ -132,7 +133,8 @@ class Live:
         if not isinstance(chosen.data, OffPolicy):
             chosen = cast(AgentConfig, replace(cast(Any, preset(config.plant).agent), hidden=chosen.hidden))
         agent = cast(OffPolicyAgent, chosen.build(env.observer.size)).endless(takeover // 2)
-        policy = LearnedPolicy(env.observer, chosen.hidden)
+        low, high = env.plant.r_tilde_bounds
+        policy = LearnedPolicy(env.observer, chosen.hidden, config.correction * (high - low) / 2)
         replay = Replay(FIELDS, 1 + COMPARED + EXPLORING, KEPT, env.observer.history)
         scale = config.reward_scale / env.plant.error_scale
         return cls(env, policy, agent, cast(OffPolicy, agent.data), scale, replay, takeover, kept, config.reward)
@@ -151,7 +153,7 @@ class Live:
         return LiveState(
             agent=agent,
             replay=self.replay.init(),
-            base=AffineParams(jnp.ones(()), zero),
+            base=affine(1.0, 0.0, self.observer.lags),
             kept=jax.tree.map(jnp.zeros_like, self.agent.actor(agent)),
             begun=jnp.zeros((), bool),
             leads=jnp.zeros((), bool),
@@ -184,7 +186,7 @@ class Live:
     def first(self, r: jax.Array, y: jax.Array) -> Sample:
         """The step before the first sample: the loop at rest at y."""
         r_tilde = jnp.clip(y, *self.observer.r_tilde_bounds)
-        return Sample(self.observer.init(r, y), r, y, r_tilde, jnp.full((), -1, jnp.int32))
+        return Sample(self.observer.init(r, y), r, y, r_tilde, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32))
 
     @partial(jax.jit, static_argnums=0)
     def gathered(self, sample: Sample) -> Others:
@@ -196,14 +198,14 @@ class Live:
 
     @partial(jax.jit, static_argnums=0)
     def act(
-        self, actors: tuple[Any, Any], base: AffineParams, before: Sample, explore: Any, r: jax.Array, y: jax.Array
+        self, actors: tuple[Any, Any], base: LinearLaw, before: Sample, explore: Any, r: jax.Array, y: jax.Array
     ) -> tuple[Memory, jax.Array]:
         """At t_k: the memory, and r~ (2,) of the fallback and the learned actor, both with `explore` added."""
         memory = self.observer.record(before.memory, before.y, before.r_tilde)
         memory, obs = self.observer.observe(memory, r, y)
         actions = jnp.stack([self.policy.action(actor, obs) for actor in actors])
         actions = jnp.clip(actions + explore, -1.0, 1.0)
-        return memory, jax.vmap(self.policy.r_tilde, (None, None, 0))(base, r, actions)
+        return memory, jax.vmap(self.policy.r_tilde, (None, None, None, None, 0))(base, memory, r, y, actions)
 
     @partial(jax.jit, static_argnums=0)
     def relive(
@@ -246,11 +248,15 @@ class Live:
         known = jnp.any(state.response.b != 0.0)
         rows = jnp.where(known, jax.vmap(self.row, (None, 0, 0, 0))(state.base, before, r, y), row[None])
         age = jnp.where(now.age == 0, 0, before.age + 1)
-        others = Others(Sample(memory, r, y, r_tilde, age), dy, dr_tilde, other_noise)
+        held = jnp.where(r == before.r, before.held + 1, 0)
+        others = Others(Sample(memory, r, y, r_tilde, age, held), dy, dr_tilde, other_noise)
         return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED]
 
-    def row(self, base: AffineParams, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
-        """The replay's row for the step from sample `before` to r and y; (width,)."""
+    def row(self, base: LinearLaw, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
+        """The replay's row for the step from sample `before` to r and y; (width,).
+
+        Its action may lie beyond [-1, 1] if r passed through.
+        """
         signals = Signals(
             r=before.r,
             y=before.y,
@@ -262,14 +268,11 @@ class Live:
         )
         plant, earlier = self.env.plant, before.memory.r_tilde_past[0]
         price = rewards.params(plant, self.reward)
-        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier, plant.reward_terms)
-        action, never = self._action(base, before.r, before.r_tilde), jnp.zeros_like(y)
+        held = before.held.astype(y.dtype)
+        reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier, plant.reward_terms, held)
+        action = (before.r_tilde - unclipped(base, before.memory, before.r, before.y)) / self.policy.scale
+        never = jnp.zeros_like(y)
         return jnp.stack([*signals, action, self.reward_scale * reward, never, never])
-
-    def _action(self, base: AffineParams, r: jax.Array, r_tilde: jax.Array) -> jax.Array:
-        """The action that gives r~; it may lie beyond [-1, 1] if r passed through."""
-        low, high = self.observer.r_tilde_bounds
-        return (r_tilde - base.offset - base.slope * r) / ((high - low) / 2)
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def write(self, replay: ReplayState, rows: jax.Array) -> ReplayState:
@@ -277,12 +280,12 @@ class Live:
         return self.replay.write(replay, rows)
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
-    def relabelled(self, replay: ReplayState, base: AffineParams) -> ReplayState:
-        """The replay with its actions recomputed for another base law."""
+    def relabelled(self, replay: ReplayState, base: LinearLaw) -> ReplayState:
+        """The replay with its actions recomputed for a base law without memory."""
         rows, places = replay.rows, [FIELDS.index(name) for name in ("r", "r_tilde", "action")]
-        r, r_tilde = (rows[..., place].astype(base.slope.dtype) for place in places[:2])
-        action = self._action(base, r, r_tilde).astype(rows.dtype)
-        return replay._replace(rows=rows.at[..., places[2]].set(action))
+        r, r_tilde = (rows[..., place].astype(base.r.dtype) for place in places[:2])
+        action = (r_tilde - base.offset - base.r * r) / self.policy.scale
+        return replay._replace(rows=rows.at[..., places[2]].set(action.astype(rows.dtype)))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update(self, agent: Any, replay: ReplayState, key: chex.PRNGKey, number: jax.Array) -> Any:
@@ -292,7 +295,7 @@ class Live:
         transitions = batch(self.replay, self.observer, self.data.discount, replay, bits)
         return self.agent.update(agent, transitions, key_update)[0]
 
-    def identify(self, replay: ReplayState) -> tuple[AffineParams, Response]:
+    def identify(self, replay: ReplayState) -> tuple[LinearLaw, Response]:
         """Identify the static inverse, r~ = (r - offset) / gain, and the response, by a linear model of recent steps.
 
         Raises:
@@ -312,9 +315,10 @@ class Live:
                 f"the DC gain is uncertain: {of_all} from the whole record, {first} and {last} from its halves"
             )
         dtype = jnp.result_type(float)
-        found = (1.0 / gains[0], -linear_models.offset(whole) / gains[0], whole.a, whole.b)
-        slope, offset, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # this way nothing is compiled
-        return AffineParams(slope, offset), Response(a, b)
+        offset, nothing = -linear_models.offset(whole) / gains[0], np.zeros(self.observer.lags)
+        found = (offset, 1.0 / gains[0], 0.0, nothing, nothing, whole.a, whole.b)
+        *law, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # this way nothing is compiled
+        return LinearLaw(*law), Response(a, b)
 
     def _record(self, replay: ReplayState) -> Record:
         """Windows of H uninterrupted steps of the loop, each with the y after it."""

@@ -242,7 +242,8 @@ class Loop:
         """Record the step in state and replay; returns the predicted y of the compared policies."""
         state, follows = self._state._replace(sample=before), fine and self._unbroken
         age: Any = np.int32(before.age + 1 if follows else 0)
-        now = Sample(memory, r, y, self._float(self._r_tilde), age)
+        held: Any = np.int32(before.held + 1 if r == before.r else 0)
+        now = Sample(memory, r, y, self._float(self._r_tilde), age, held)
         self._unbroken = fine
         if not (self.settings.learn or self._known):
             self._state = state._replace(sample=now)

@@ -25,6 +25,7 @@ DEFAULT = {
 }
 ROBUST = {
     **DEFAULT,
+    "base": "static",
     "history": 20,
     "randomise": (
         ("Pi", 0.3, 18.0),

@@ -16,6 +16,7 @@ NOISE_SEEDS = 32
 DELAYED = (10.13, 2.46)  # the paper's only delayed case; no reading of it gives 10.13 exactly
 
 ROBUST = {
+    "base": "static",
     "history": 80,  # longer than the longest delay
     "randomise": (
         ("tau", 0.3, 0.7),

@@ -6,13 +6,15 @@ from collections.abc import Mapping
 
 from jaxouter.tasks.task import Options
 
-PAPER: Options = {"agent": "ddpg", "agent.prefill": 200}
+PAPER: Options = {"agent": "ddpg", "agent.prefill": 200, "base": "absolute"}
 DEFAULT: Options = {
     "steps": 0,
     "environments": 16,
     "epoch": 6_000,
-    "residual": True,
+    "base": "lq",
     "reward_scale": 0.1,
+    "reward.huber": 0.003,
+    "reward.rest": 0.2,
     "integral_steps": 20.0,
     "pretraining.gradient_steps": 1_500,
     "pretraining.noise": 0.015,

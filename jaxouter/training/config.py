@@ -6,7 +6,7 @@ import dataclasses
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
 import tyro
@@ -19,17 +19,18 @@ from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
 INTERNAL = ("plant", "preset", "explored_steps", "plant_options")  # fields that are no options by name
+Base = Literal["lq", "static", "none", "absolute"]
 HUGE = 2**31  # numbers of a configuration must be smaller
 
 
 @dataclass(frozen=True)
 class PretrainingConfig:
-    """Pretraining of the actor on a model identified from recorded episodes, before the agent learns on the plant."""
+    """Recorded episodes, and pretraining of the actor on a model identified from them, before the agent learns."""
 
     gradient_steps: int = 0
     """Gradient steps of the actor on the identified model; 0: no pretraining."""
     episodes: int = 64
-    """Episodes of the plant recorded under random r~, in addition to --steps."""
+    """Episodes of the plant recorded under random r~, in addition to --steps; the base law lq is made from them too."""
     plants: int = 1
     """Plants they are recorded on, each drawn from --randomise; more than one needs --randomise."""
     episode_steps: int | None = None
@@ -89,8 +90,11 @@ class TrainConfig:
     """Probability at each control step that the set-point is redrawn within an episode."""
     randomise: plants.Ranges = ()
     """Parameters of the plant drawn for each episode: name, least, greatest value, repeated for each."""
-    residual: bool = False
-    """Learn a correction to the static prefilter (identified first) instead of r~ itself."""
+    base: Base = "lq"
+    """Base law, which the actor corrects: lq (linear-quadratic law of a record), static (inverse of the DC gain), none
+    (r~ = r) or absolute (the middle of the range of r~)."""
+    correction: float = 1.0
+    """Largest correction of the base law; 1 is half the range of r~."""
     reward_scale: float = 1.0
     """Factor on the reward (in the plant's error scales) that the agent learns from."""
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -126,7 +130,7 @@ class TrainConfig:
                 f"pretraining.episodes is {self.pretraining.episodes}; it must be a multiple of the "
                 f"{self.pretraining.plants} plants"
             )
-        for name in ("seeds", "devices", "environments", "epoch", "reward_scale"):
+        for name in ("seeds", "devices", "environments", "epoch", "reward_scale", "correction"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if self.steps < 0 or not (self.steps or self.pretraining.gradient_steps):
@@ -170,8 +174,14 @@ class TrainConfig:
         plant, start = plants.make(self.plant)[0], self.pretraining
         if plant.identified:
             return 0
-        recorded = start.episodes * (start.episode_steps or plant.episode_steps) if start.gradient_steps else 0
-        return self.explored_steps + recorded + (LEVELS * plant.episode_steps if self.residual else 0)
+        recorded = start.episodes * (start.episode_steps or plant.episode_steps) if self.records else 0
+        levels = LEVELS * plant.episode_steps if self.base in ("static", "lq") else 0
+        return self.explored_steps + recorded + levels
+
+    @property
+    def records(self) -> bool:
+        """Whether episodes are recorded, for the base law or for pretraining."""
+        return self.base == "lq" or self.pretraining.gradient_steps > 0
 
     @property
     def environment_steps(self) -> int:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxouter.agents import Agent
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Signals
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw, affine
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 AXIS = "environments"  # mesh axis of a learner's shards
@@ -27,7 +27,7 @@ class TrainState(NamedTuple):
     env: EnvState  # (E, ...)
     obs: jax.Array  # (E, n)
     noise: Any  # (E, ...), state of the exploration noise
-    base: AffineParams  # base law of the policy
+    base: LinearLaw  # base law of the policy
     key: chex.PRNGKey
     steps: jax.Array  # int32, environment steps so far
 
@@ -78,7 +78,7 @@ class Environments:
             env=env,
             obs=obs,
             noise=self.agent.noise(self.count),
-            base=AffineParams(jnp.zeros(()), jnp.asarray((low + high) / 2, float)),
+            base=affine(0.0, (low + high) / 2, self.env.observer.lags),
             key=key,
             steps=jnp.zeros((), jnp.int32),
         )
@@ -126,7 +126,8 @@ class Environments:
     ) -> tuple[TrainState, Step]:
         """One step of every environment, given actions (E,) and keys (E,)."""
         before = state.env
-        r_tilde = jax.vmap(self.policy.r_tilde, (None, 0, 0))(state.base, before.r, action)
+        of_each = jax.vmap(self.policy.r_tilde, (None, 0, 0, 0, 0))
+        r_tilde = of_each(state.base, before.memory, before.r, before.y_seen, action)
         obs, env, reward, terminated, truncated, info = jax.vmap(self.env.step, (0, 0, 0, None))(
             keys, before, r_tilde, params
         )
@@ -159,7 +160,8 @@ class Environments:
 
         def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
             obs, env, weight = carry
-            r_tilde = self.policy.r_tilde(state.base, env.r, self.policy.action(learned.actor, obs))
+            action = self.policy.action(learned.actor, obs)
+            r_tilde = self.policy.r_tilde(state.base, env.memory, env.r, env.y_seen, action)
             obs, env, reward, terminated, _, _ = self.env.step_env(key, env, r_tilde, params)
             return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
 

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxouter.agents.networks import Actor, act
 from jaxouter.loop.observation import Memory, Observer
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw, unclipped
 
 
 class LearnedParams(NamedTuple):
     """Parameters of the learned policy."""
 
     actor: Any
-    base: AffineParams  # base law, r~ at zero action: the middle of the range, or the static prefilter
+    base: LinearLaw  # r~ at zero action
 
 
 @dataclass(frozen=True)
 class LearnedPolicy:
-    """r~ = clip(base(r) + half the range of r~ times tanh(actor(observation))), whichever agent learned the actor."""
+    """r~ = clip(base(memory, r, y) + scale tanh(actor(observation))), whichever agent learned the actor."""
 
     observer: Observer
     hidden: tuple[int, ...]
     """Widths of the actor's hidden layers."""
+    scale: float
+    """Largest correction of the base law, in the unit of r~."""
     host: bool = False
 
     def init_actor(self, key: chex.PRNGKey) -> Any:
@@ -38,10 +41,16 @@ class LearnedPolicy:
         """Action in [-1, 1] (scalar) of an observation (n,)."""
         return act(self.hidden, actor, obs)[0]
 
-    def r_tilde(self, base: AffineParams, r: jax.Array, action: jax.Array) -> jax.Array:
-        """r~ (scalar, clipped to its bounds) of an action in [-1, 1] (scalar)."""
-        low, high = self.observer.r_tilde_bounds
-        return jnp.clip(base.offset + base.slope * r + (high - low) / 2 * action, low, high)
+    def r_tilde(self, base: LinearLaw, memory: Memory, r: jax.Array, y: jax.Array, action: jax.Array) -> jax.Array:
+        """r~ (scalar, clipped to its bounds) of an action in [-1, 1] (scalar), at t_k."""
+        return jnp.clip(unclipped(base, memory, r, y) + self.scale * action, *self.observer.r_tilde_bounds)
+
+    def trimmed(self, params: LearnedParams) -> tuple[LearnedPolicy, LearnedParams]:
+        """The same policy and parameters without the base law's last coefficients that are zero."""
+        used = [np.flatnonzero(np.asarray(each)) for each in (params.base.y_past, params.base.r_tilde_past)]
+        n = 1 + max(int(each.max(initial=-1)) for each in used)
+        base = params.base._replace(y_past=params.base.y_past[:n], r_tilde_past=params.base.r_tilde_past[:n])
+        return replace(self, observer=replace(self.observer, lags=n)), params._replace(base=base)
 
     def init(self, params: LearnedParams, r0: jax.Array, y0: jax.Array) -> Memory:
         """Memory before the first step."""
@@ -54,5 +63,5 @@ class LearnedPolicy:
         """Observe, act and update the memory; no exploration."""
         del key
         memory, obs = self.observer.observe(carry, r, y)
-        r_tilde = self.r_tilde(params.base, r, self.action(params.actor, obs))
+        r_tilde = self.r_tilde(params.base, memory, r, y, self.action(params.actor, obs))
         return self.observer.record(memory, y, r_tilde), r_tilde

@@ -1,7 +1,7 @@
 """Model-based pretraining: train the actor by back-propagation through whole episodes (analytic policy gradient).
 
-`DifferentiableRollout` takes any differentiable plant. `pretrain` passes a model identified from recorded r~ and y
-alone; the baseline `oracle` passes the plant itself.
+`DifferentiableRollout` takes any differentiable plant. Training passes a model identified from recorded r~ and y alone;
+the baseline `oracle` passes the plant itself.
 
 The first layer is trained on whitened observations, and the whitening is then folded into it: consecutive samples of y
 differ little, but these small differences carry the state of the plant.
@@ -24,9 +24,10 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from jaxouter.identification import counterfactual, records
-from jaxouter.loop import closed_loop, rewards
-from jaxouter.loop.policy import AffineParams, Policy
-from jaxouter.loop.references import redrawn
+from jaxouter.identification.records import Record
+from jaxouter.loop import rewards
+from jaxouter.loop.episodes import TrainingEpisodes
+from jaxouter.loop.policy import LinearLaw
 from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE
@@ -77,20 +78,14 @@ class Whitening(NamedTuple):
 class DifferentiableRollout:
     """Training episodes as a differentiable function. Static and hashable."""
 
-    plant: Plant
+    episodes: TrainingEpisodes
     policy: LearnedPolicy
     batch: int = 64
     """Episodes per gradient step (and seed)."""
-    noise: float = 0.0
-    """Largest standard deviation of measurement noise, in half of the episodes; 1 is half the set-point range."""
-    load: float = 0.0
-    """Largest load (unseen step added to r~ at a random time), in half of the episodes; 1 is half the r~ range."""
     log_above: float = 0.0
     """c > 0: a cost per step counts as c log(1 + cost / c); 0: it counts in full."""
     devices: int = 1
     """Devices of this process that share the episodes of a gradient step evenly."""
-    reward: RewardConfig = rewards.PAPER
-    """Weights of the reward."""
 
     @classmethod
     def of(
@@ -103,66 +98,28 @@ class DifferentiableRollout:
         reward: RewardConfig = rewards.PAPER,
     ) -> DifferentiableRollout:
         """The roll-out as configured, on as many of the devices as can share a batch evenly."""
-        devices = math.gcd(batch, devices)
-        return cls(plant, policy, batch, config.noise, config.load, config.log_above, devices, reward)
+        episodes = TrainingEpisodes(plant, config.noise, config.load, reward)
+        return cls(episodes, policy, batch, config.log_above, math.gcd(batch, devices))
 
-    def episode(self, policy: Policy, policy_params: Any, plant_params: Any, key: chex.PRNGKey) -> Any:
-        """One episode: mean reward per step in error scales, and the policy's carries (T, ...) with r and y (T,)."""
-        plant, steps = self.plant, self.plant.episode_steps
-        key_draw, key_start, key_r, key_run, key_smooth, key_noise, key_load = jax.random.split(key, 7)
-        plant_params = plant_params if plant.draw is None else plant.draw(key_draw, plant_params)
-        smooth = jax.random.bernoulli(key_smooth)
-        plant_params = jax.tree.map(partial(jnp.where, smooth), plant.noise_free(plant_params), plant_params)
-        price = rewards.params(plant, self.reward)
-        r = redrawn(key_r, steps, *plant.setpoint_range)
-        load, noise = self._load(key_load, steps), self._noise(key_noise, steps)
-        state = plant.training_start(key_start, plant_params)
-        begun = closed_loop.begin(plant, plant_params, state)
+    @property
+    def plant(self) -> Plant:
+        """The plant."""
+        return self.episodes.plant
 
-        def step(carry: Any, x: Any) -> Any:
-            loop, memory = carry
-            r_k, noise_k, load_k, key = x
-            loop = loop._replace(y_seen=loop.y + noise_k)
-            after, remembered, reward, _ = closed_loop.step(
-                plant,
-                plant_params,
-                price,
-                policy,
-                policy_params,
-                loop,
-                memory,
-                r_k,
-                key,
-                load=load_k,
-                terms=plant.reward_terms,
-            )
-            return (after, remembered), (reward / plant.error_scale, memory, r_k, loop.y_seen)
-
-        begin = begun, policy.init(policy_params, r[0], begun.y + noise[0])
-        _, (reward, *seen) = jax.lax.scan(step, begin, (r, noise, load, jax.random.split(key_run, steps)))
-        return jnp.mean(reward), seen
-
-    def _noise(self, key: chex.PRNGKey, steps: int) -> jax.Array:
-        """Measurement noise (steps,)."""
-        key_level, key_run = jax.random.split(key)
-        level = jnp.maximum(0.0, jax.random.uniform(key_level, (), float, -1.0, 1.0))
-        return self.noise * self.policy.observer.y_scale * level * jax.random.normal(key_run, (steps,), float)
-
-    def _load(self, key: chex.PRNGKey, steps: int) -> jax.Array:
-        """Load on r~ (steps,): zero, then constant from a random time on."""
-        low, high = self.plant.r_tilde_bounds
-        since, size = jax.random.uniform(key, (2,), float, -1.0, 1.0)
-        step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
-        return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
+    def mean_reward(self, params: LearnedParams, plant_params: Any, key: chex.PRNGKey) -> jax.Array:
+        """Mean reward per step of one episode, in error scales."""
+        return jnp.mean(self.episodes.run(self.policy, params, plant_params, key).reward / self.plant.error_scale)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-    def whitening(self, base: AffineParams, plant_params: Any, key: chex.PRNGKey) -> Whitening:
+    def whitening(self, base: LinearLaw, plant_params: Any, key: chex.PRNGKey) -> Whitening:
         """Whitening of the observations under a zero action."""
         zero = jax.tree.map(jnp.zeros_like, self.policy.init_actor(key))
 
         def observed(key: chex.PRNGKey) -> jax.Array:
-            _, seen = self.episode(self.policy, LearnedParams(zero, base), plant_params, key)
-            return jax.vmap(lambda carry, r, y: self.policy.observer.observe(carry, r, y)[1])(*seen)
+            seen = self.episodes.run(self.policy, LearnedParams(zero, base), plant_params, key)
+            return jax.vmap(lambda memory, r, y: self.policy.observer.observe(memory, r, y)[1])(
+                seen.memory, seen.r, seen.y_seen
+            )
 
         obs = jax.vmap(observed)(jax.random.split(key, self.batch)).reshape(-1, self.policy.observer.size)
         variance, axes = jnp.linalg.eigh(jnp.cov(obs, rowvar=False))
@@ -170,7 +127,7 @@ class DifferentiableRollout:
 
     @partial(jax.jit, static_argnums=0)
     def train(
-        self, carry: Any, white: Whitening, base: AffineParams, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
+        self, carry: Any, white: Whitening, base: LinearLaw, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
     ) -> tuple[Any, jax.Array]:
         """Gradient steps with the given rates (n,), each on fresh episodes.
 
@@ -186,7 +143,7 @@ class DifferentiableRollout:
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
             params = LearnedParams(folded(actor, white), base)
-            cost = jax.vmap(lambda key: -self.episode(self.policy, params, plant_params, key)[0])(keys)
+            cost = jax.vmap(lambda key: -self.mean_reward(params, plant_params, key))(keys)
             return jnp.mean(self.log_above * jnp.log1p(cost / self.log_above) if self.log_above else cost)
 
         def update(actor: Any, state: Any, rate: jax.Array, keys: chex.PRNGKey) -> Any:
@@ -234,55 +191,35 @@ def cosine(steps: int) -> jax.Array:
     return jnp.asarray(RATE * (1.0 + np.cos(np.pi * np.arange(steps) / steps)) / 2, float)
 
 
-def pretrain(
+def recorded(
     config: PretrainingConfig,
     plant: Plant,
     plant_params: Any,
-    policy: LearnedPolicy,
-    learned: LearnedParams,
     key: chex.PRNGKey,
-    report: Report = lambda at, actor: None,
-    begin: PretrainingState | None = None,
-    devices: int = 1,
     say: Say = lambda what, done, of: None,
-    reward: RewardConfig = rewards.PAPER,
-) -> Any:
-    """Pretrain an actor on a plant model that is identified from recorded episodes.
-
-    A plant that consists of identified models is used directly.
-
-    Args:
-        config: numbers of episodes and gradient steps, among others.
-        plant, plant_params: only recorded, through r~ and y.
-        policy, learned: the policy and its initial parameters; the actor's first layer takes whitened observations.
-        key: random numbers.
-        report: see `Report`.
-        begin: state from which to resume a pretraining with the same arguments; None: from its start.
-        devices: of this process, to share the episodes of a gradient step.
-        say: see `Say`.
-        reward: weights of the reward.
-
-    Returns:
-        The actor's parameters, for plain observations.
-    """
-    key_record, *keys = jax.random.split(key, 3)
-    if plant.identified:
-        return pretrain_on(config, plant, plant_params, policy, learned, keys, report, begin, devices, say, reward)
-    lags = config.lags or policy.observer.history
+) -> list[Record]:
+    """Recorded episodes of each of the configured plants, through r~ and y alone."""
     longer = replace(plant, episode_steps=config.episode_steps or plant.episode_steps)
-    models = []
-    for i, key_plant in enumerate(jax.random.split(key_record, config.plants)):
+    found = []
+    for i, key_plant in enumerate(jax.random.split(key, config.plants)):
         say("recording", i, config.plants)
         one = plant_params if plant.draw is None else plant.draw(jax.random.fold_in(key_plant, 1), plant_params)
-        data = records.record(longer, one, key_plant, config.episodes // config.plants)
-        models.append(counterfactual.fit(data, lags))
-    model = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
-    return pretrain_on(
-        config, counterfactual.plant(plant, lags), model, policy, learned, keys, report, begin, devices, say, reward
-    )
+        found.append(records.record(longer, one, key_plant, config.episodes // config.plants))
+    return found
 
 
-def pretrain_on(
+def model_of(
+    config: PretrainingConfig, plant: Plant, plant_params: Any, data: Sequence[Record], history: int
+) -> tuple[Plant, Any]:
+    """The differentiable plant of recorded episodes, and its parameters; a plant of identified models as it is."""
+    if plant.identified:
+        return plant, plant_params
+    models = [counterfactual.fit(each, config.lags or history) for each in data]
+    params = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *models)
+    return counterfactual.plant(plant, config.lags or history), params
+
+
+def pretrain(
     config: PretrainingConfig,
     plant: Plant,
     plant_params: Any,
@@ -297,22 +234,33 @@ def pretrain_on(
 ) -> Any:
     """Pretrain an actor on a differentiable plant, of which each episode is a draw.
 
-    Instability may show only late in an episode, but long episodes help only an actor that already controls short ones.
-    So if longer episodes than the plant's are configured, they come last. Gradients through an unstable loop are
-    useless: if the loop becomes unstable, training returns to the state two reports ago, and continues with other
-    episodes and half the learning rate, which grows again while all is well.
+    Its correction of the base law is near zero at first. Instability may show only late in an episode, but long
+    episodes help only an actor that already controls short ones, so if longer episodes than the plant's are configured,
+    they come last. Gradients through an unstable loop are useless: if the loop becomes unstable, training returns to
+    the state two reports ago, and continues with other episodes and half the learning rate, which grows again while all
+    is well.
 
     Args:
-        config, policy, learned, report, begin, devices, say, reward: as for `pretrain`.
+        config: number of gradient steps, among others.
         plant, plant_params: with the plant's own length of an episode.
+        policy, learned: the policy and its initial parameters; the actor's first layer takes whitened observations.
         keys: two, for the whitening and for the episodes.
+        report: see `Report`.
+        begin: state from which to resume a pretraining with the same arguments; None: from its start.
+        devices: of this process, to share the episodes of a gradient step.
+        say: see `Say`.
+        reward: weights of the reward.
+
+    Returns:
+        The actor's parameters, for plain observations.
     """
     key_white, key_run = keys
     base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices, reward)]
     longer = config.gradient_steps  # first step with longer episodes
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
-        stages.append(replace(stages[0], plant=replace(plant, episode_steps=config.episode_steps)))
+        longer_plant = replace(plant, episode_steps=config.episode_steps)
+        stages.append(replace(stages[0], episodes=replace(stages[0].episodes, plant=longer_plant)))
     say("compiling", 0, 0)
     white = stages[0].whitening(base, plant_params, key_white)
     rates, at = cosine(config.gradient_steps), PretrainingState.begin(learned.actor) if begin is None else begin

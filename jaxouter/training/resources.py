@@ -126,7 +126,7 @@ def _gradient_step(trainer: Trainer, params: EnvParams, state: TrainState) -> fl
     learned = trainer.policy_params(state)
 
     def reward(learned: Any, model: Any, key: Any) -> jax.Array:
-        return rollout.episode(trainer.policy, learned, model, key)[0]
+        return rollout.mean_reward(learned, model, key)
 
     return start.batch_size * steps * _flop(jax.value_and_grad(reward), learned, model, state.key)
 

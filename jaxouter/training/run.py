@@ -34,7 +34,7 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.trainer import Trainer, build
 
-FORMAT = 3
+FORMAT = 4
 RUNS = Path("runs")  # default parent of run folders
 KEEP = 2  # checkpoints per seed
 SAVED = ("checkpoint-*.npz", "pretraining.npz")  # files that a seed can resume from
@@ -223,7 +223,7 @@ class RunFolder:
             ValueError: there is none, or it is not readable.
         """
         trainer, _ = self.trainer
-        return trainer.policy, trainer.policy_params(self.load(seed)[0])
+        return trainer.policy.trimmed(trainer.policy_params(self.load(seed)[0]))
 
     def save_pretraining(self, seed: int, at: PretrainingState) -> None:
         """Save the state of a seed's pretraining, until there is a checkpoint.

@@ -6,20 +6,23 @@ Python in between shows progress, evaluates and saves (`jaxouter.training.epochs
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
 import chex
 import jax
+import numpy as np
 
 from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.replay import Replay
-from jaxouter.identification import steady_state
+from jaxouter.identification import lq, steady_state
+from jaxouter.identification.records import Record, within
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
+from jaxouter.loop.policy import LinearLaw, none, padded
 from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.plants.base import RUN_ONCE
@@ -28,10 +31,11 @@ from jaxouter.training.environments import AXIS, Environments, TrainState
 from jaxouter.training.off_policy import FIELDS, OffPolicyDriver
 from jaxouter.training.on_policy import OnPolicyDriver
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import PretrainingState, Say, pretrain
+from jaxouter.training.pretraining import PretrainingState, Say, model_of, pretrain, recorded
 
 PRETRAINING = 1  # folded into a key
 DIAGNOSIS = 2  # likewise
+BASE = 3  # likewise
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,7 @@ class Trainer:
         devices: int = 1,
         say: Say = lambda what, done, of: None,
     ) -> TrainState:
-        """State before the prefill.
-
-        Identifies the static prefilter if it is the policy's base law, and pretrains the actor if configured.
+        """State before the prefill: records the plant, makes the base law, and pretrains the actor, as configured.
 
         Args:
             seed, params: of the training; of the environments.
@@ -92,35 +94,43 @@ class Trainer:
         key_base, key = jax.random.split(jax.random.key(seed))
         say("compiling", 0, 0)
         state = self._fresh(key, params)
-        plant = self.env.plant
-        if self.config.residual:
-            say("recording", 0, 0)
-            state = state._replace(base=steady_state.static(plant, params.plant, key_base)[1])
-        if self.config.pretraining.gradient_steps:
-            key_start = jax.random.fold_in(key_base, PRETRAINING)
-            cfg, learned = self.config.pretraining, self.policy_params(state)
+        plant, start = self.env.plant, self.config.pretraining
+        key_record, *keys = jax.random.split(jax.random.fold_in(key_base, PRETRAINING), 3)
+        of_plant = self.config.base == "lq" or not plant.identified
+        data = recorded(start, plant, params.plant, key_record, say) if self.config.records and of_plant else []
+        state = state._replace(base=self._base(state.base, params, data, key_base, say))
+        if not start.gradient_steps:
+            return state
 
-            def with_actor(actor: Any) -> TrainState:
-                return state._replace(agent=self.agent.with_actor(state.agent, actor))
+        def with_actor(actor: Any) -> TrainState:
+            return state._replace(agent=self.agent.with_actor(state.agent, actor))
 
-            def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
-                report(at, lambda: with_actor(actor()))
+        def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
+            report(at, lambda: with_actor(actor()))
 
-            actor = pretrain(
-                cfg,
-                plant,
-                params.plant,
-                self.policy,
-                learned,
-                key_start,
-                reported,
-                begin,
-                devices,
-                say,
-                self.config.reward,
-            )
-            state = with_actor(actor)
-        return state
+        model = model_of(start, plant, params.plant, data, self.env.observer.history)
+        learned, reward = self.policy_params(state), self.config.reward
+        return with_actor(pretrain(start, *model, self.policy, learned, keys, reported, begin, devices, say, reward))
+
+    def _base(
+        self, middle: LinearLaw, params: EnvParams, data: Sequence[Record], key: chex.PRNGKey, say: Say
+    ) -> LinearLaw:
+        """The configured base law: `middle`, or one that is made here."""
+        plant, kind, lags = self.env.plant, self.config.base, self.env.observer.lags
+        if kind == "absolute":
+            return middle
+        if kind == "none":
+            return none(plant)[1]
+        say("recording", 0, 0)
+        law = steady_state.static(plant, params.plant, key)[1]
+        if kind == "static":
+            return law
+        start = self.config.pretraining
+        data = [within(each, plant.divergence_bounds) for each in data]
+        key_choose = jax.random.fold_in(key, BASE)
+        found = lq.choose(plant, data, law, key_choose, self.env.observer.history, start.noise, start.load)
+        lq.warn_short(plant, found.most)
+        return padded(found.law if found.mae < found.static_mae else law, lags)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
@@ -165,12 +175,16 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
     lags, most = start.lags or env.observer.history, (start.episode_steps or plant.episode_steps) // 2
     if start.gradient_steps and lags > most:
         raise ValueError(f"pretraining.lags is {lags}; it must be at most half a recorded episode, {most}")
+    if config.base == "lq":
+        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
+        of_base = max(lq.lags_for(longer, env.observer.history))
+        env = replace(env, observer=replace(env.observer, lags=of_base))
     # The functions are the same for all seeds, so they are compiled once.
     config = replace(config, seed=0, seeds=1, devices=1)
     agent = config.agent.build(env.observer.size, config.total_updates, AXIS if shards > 1 else None)
     environments = Environments(
         env,
-        LearnedPolicy(env.observer, config.agent.hidden),
+        LearnedPolicy(env.observer, config.agent.hidden, config.correction * float(np.ptp(plant.r_tilde_bounds)) / 2),
         agent,
         count=config.environments // shards,
         steps=config.steps,

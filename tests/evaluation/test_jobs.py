@@ -278,7 +278,7 @@ def test_load_gives_a_rival_as_it_was_identified():
     expected = steady_state.static(*lag.make(), jax.random.key(0))
     assert policy == expected[0]
     assert_same_trees(params, expected[1])
-    assert float(params.slope) == pytest.approx(2.0, abs=1e-3)  # of the lag, 1 / K
+    assert float(params.r) == pytest.approx(2.0, abs=1e-3)  # of the lag, 1 / K
 
 
 def test_load_gives_the_seed_of_a_run(run):

@@ -57,7 +57,7 @@ def test_time_restarts_at_each_set_point():
 
 def test_references_that_are_no_set_points_have_no_segment_figures():
     out = figures_of_merit(traces([1, 2, 3], [1, 2, 3]), replace(PITCH, segments=False))
-    assert (out.itae, out.overshoot, out.settling_time, out.steady_state_error) == (None,) * 4
+    assert (out.itae, out.overshoot, out.settling_time, out.steady_state_error, out.swing) == (None,) * 5
     assert out.mae == 0.0
 
 
@@ -79,6 +79,11 @@ def test_total_variation_starts_at_the_clipped_first_output():
     assert out.r_tilde_tv == pytest.approx(6 + 10 + 5)
 
 
+def test_swing_is_of_the_second_half_of_the_worst_set_point():
+    out = figures_of_merit(traces([1] * 4 + [2] * 4, [0] * 8, r_tilde=[0, 9, 4, 4, 9, 0, 1, 3]), PITCH)
+    assert out.swing == pytest.approx(1.0)
+
+
 def test_improvement_means_nothing_where_the_inner_loop_is_unstable():
     unstable = replace(PITCH, stable_alone=False)
     assert figures_of_merit(traces([1], [1]), unstable, inner_mae=3.0).improvement is None
@@ -94,6 +99,7 @@ def test_figures_are_written_with_all_their_keys_and_read_back():
         written = msgspec.to_builtins(found)
         assert set(written) - extra == {
             "mae", "improvement", "iae", "ise", "itae", "overshoot", "settling_time", "steady_state_error",
-            "violation_time", "violation_max", "violation_time_each", "violation_max_each", "r_tilde_tv", "return",
+            "violation_time", "violation_max", "violation_time_each", "violation_max_each", "swing", "r_tilde_tv",
+            "return",
         }  # fmt: skip
         assert msgspec.convert(written, FiguresOfMerit) == found

@@ -9,8 +9,9 @@ from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop.policy import none
 from tests.precision import of_single_draws
 
-PITCH = "paper delay-0.57 delay-5.7 delay-swapped uncertainty load noise steps staircase ramps sines doublets"
-HEATERS = "paper-4 paper-1000 riccati cold mixed-stock load noise steps staircase ramps days"
+REST = " rest rest-noise"
+PITCH = "paper delay-0.57 delay-5.7 delay-swapped uncertainty load noise steps staircase ramps sines doublets" + REST
+HEATERS = "paper-4 paper-1000 riccati cold mixed-stock load noise steps staircase ramps days" + REST
 
 
 @pytest.mark.parametrize(("plant", "names"), [("pitch", PITCH), ("heaters", HEATERS)])
@@ -91,7 +92,9 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
     from tests import lag
 
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
-    assert list(scenarios.catalogue("lag")) == ["lag/steps", "lag/staircase", "lag/ramps"]
+    assert list(scenarios.catalogue("lag")) == [
+        f"lag/{name}" for name in ("steps", "staircase", "ramps", *REST.split())
+    ]
     scenario = scenarios.get("lag/staircase", 3)
     chex.assert_shape(rollout(*none(scenario.plant), scenario).y, (3, 100))
 
@@ -140,3 +143,13 @@ HEATERS_RANGES = (("Pi", 0.3, 2.0), ("x_out", -15.0, 0.0), ("Ca", 7.0, 13.0), ("
 )
 def test_place_of_a_scenario_among_the_plants_of_a_training(name, ranges, noise, place):
     assert scenarios.place(scenarios.get(name), name.split("/")[0], ranges, noise) == place
+
+
+def test_set_points_over_the_range_are_held_long_without_disturbance_and_with_noise_where_named():
+    quiet, noisy = (scenarios.get(f"heaters/{name}") for name in ("rest", "rest-noise"))
+    assert quiet.r.shape == (19, 1_200)
+    np.testing.assert_allclose(quiet.r[:, [0, -1]], np.linspace(15.0, 25.0, 19)[:, None] * np.ones(2), rtol=1e-6)
+    assert float(quiet.params.house.sigma.max()) == 0.0
+    assert float(quiet.sensor.noise) == 0.0
+    assert float(noisy.sensor.noise) == pytest.approx(0.06)
+    assert not {"heaters/rest", "heaters/rest-noise"} & set(scenarios.reported("heaters"))

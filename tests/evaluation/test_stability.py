@@ -16,7 +16,7 @@ from jaxouter.evaluation.baselines.pi import PI, PIParams
 from jaxouter.evaluation.stability import LocalStability, analyse, spectral_radius
 from jaxouter.identification import steady_state
 from jaxouter.loop.observation import Observer
-from jaxouter.loop.policy import AffineParams, Policy, none
+from jaxouter.loop.policy import Policy, affine, none
 from jaxouter.plants import Plant, make
 from jaxouter.plants.base import float_leaves, with_float_leaves
 from jaxouter.plants.heaters import HEATERS
@@ -31,7 +31,7 @@ W_NOMINAL = (0.1, 0.003, -0.003)
 
 def pi(plant: Plant, kp: float, ki: float, slope: float) -> tuple[PI, PIParams]:
     numbers = [jnp.asarray(value, float) for value in (slope, 0.0, kp, ki)]
-    return PI(plant.r_tilde_bounds, plant.control_step), PIParams(AffineParams(*numbers[:2]), *numbers[2:])
+    return PI(plant.r_tilde_bounds, plant.control_step), PIParams(affine(*numbers[:2]), *numbers[2:])
 
 
 def one(policy: Policy, policy_params: Any, plant: Plant, params: Any, set_point: float = 0.5) -> LocalStability:
@@ -209,10 +209,10 @@ def test_pi_on_lag_is_exact(kp: float, ki: float, stable: bool) -> None:
 def test_learned_policy_returns_as_fast_as_certified() -> None:
     plant, params = lag.make(d=0.1)
     observer = Observer.of(plant, history=3)
-    policy = LearnedPolicy(observer, (16, 16))
+    policy = LearnedPolicy(observer, (16, 16), 4.0)
     network = policy.init_actor(KEY)
     actor = jax.tree.map(lambda leaf: jax.random.normal(jax.random.key(1), leaf.shape, float) / 4.0, network)
-    policy_params = LearnedParams(actor, AffineParams(jnp.asarray(2.0), jnp.asarray(0.0)))
+    policy_params = LearnedParams(actor, affine(2.0, 0.0))
     found = one(policy, policy_params, plant, params)
     with jax.enable_x64(True):
         policy_params, params = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (policy_params, params))

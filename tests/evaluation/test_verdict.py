@@ -14,7 +14,8 @@ import pytest
 from jaxouter import plants
 from jaxouter.api import Run
 from jaxouter.evaluation.verdict import Verdict, judge
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw
+from jaxouter.loop.policy import affine as linear
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import RunFolder
 from jaxouter.training.trainer import build
@@ -24,8 +25,8 @@ from tests.training.small import small
 PLANT, PARAMS = kinds.late(3)()
 
 
-def affine(slope: float) -> AffineParams:
-    return AffineParams(jnp.asarray(slope), jnp.zeros(()))
+def affine(slope: float) -> LinearLaw:
+    return linear(slope, 0.0)
 
 
 SIMPLE = {"none": affine(1.0), "static": affine(2.0)}

@@ -143,7 +143,7 @@ def test_the_gain_of_what_settles_is_found_within_a_percent(plant: kinds.Maker, 
 def test_where_y_does_not_settle_the_base_is_r_itself_and_it_says_so(plant: kinds.Maker) -> None:
     with pytest.warns(IdentificationWarning, match=r"kind: y .* within an episode of 100 control steps.* r~ = r"):
         _, found = steady_state.static(*plant(), KEY)
-    assert (float(found.slope), float(found.offset)) == (1.0, 0.0)
+    assert (float(found.r), float(found.offset)) == (1.0, 0.0)
 
 
 def test_an_integrator_is_known_by_its_rate() -> None:

@@ -439,3 +439,15 @@ def test_an_action_that_is_no_number_shows_the_reference_itself(plant):
     env, params = jaxouter.make(plant)
     _, state = reset(env, KEY, params)
     chex.assert_trees_all_equal(*(step(env, KEY, state, action, params) for action in (jnp.array(jnp.nan), state.r)))
+
+
+def test_small_moves_cost_once_the_reference_has_rested() -> None:
+    """By hand, on moves of 1 crad back and forth: 0.2 / 3.5 from the third step on, and nothing before."""
+    price = rewards.RewardConfig(0.0, beta_b=0.0, delta_b=0.0, rest=0.2, rest_after=2)
+    env, params = jaxouter.make("pitch", reward=price)
+    _, state = reset(env, KEY, params)
+    before, costs = float(jnp.clip(state.y, *env.plant.r_tilde_bounds)), []
+    for i in range(4):
+        _, state, reward, *_ = step_env(env, KEY, state, scalar(before + (i + 1) % 2), params)
+        costs.append(float(reward))
+    assert costs == pytest.approx([0.0, 0.0, -0.2 / 3.5, -0.2 / 3.5], rel=1e-4)

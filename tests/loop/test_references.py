@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, redrawn, telegraph, wander
+from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, held, redrawn, telegraph, wander
 from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
@@ -239,3 +239,9 @@ def test_training_references_are_of_four_kinds_in_the_range() -> None:
     assert np.mean(moving == 0) == pytest.approx(0.2 + 0.2 * 0.13, abs=0.06)  # one set-point, or never redrawn
     assert np.mean((moving > 0) & (moving < 0.3)) == pytest.approx(0.17, abs=0.06)
     assert np.mean(moving > 0.9) == pytest.approx(0.6, abs=0.08)
+
+
+def test_steps_since_the_last_change_are_counted() -> None:
+    r = jnp.asarray([1.0, 1.0, 3.0, 3.0, 3.0, 1.0])
+    np.testing.assert_array_equal(held(r), [0, 1, 0, 1, 2, 0])
+    np.testing.assert_array_equal(held(jnp.ones(3)), [0, 1, 2])

@@ -124,3 +124,34 @@ def test_constants_are_swept_under_vmap() -> None:
     swept = jax.vmap(lane)(prices)
     chex.assert_trees_all_close(swept, -2.0 * prices)
     chex.assert_type(swept, FLOAT)
+
+
+@pytest.mark.parametrize(
+    ("e", "expected"), [(0.0, 0.0), (0.05, -0.00375), (0.1, -0.015), (0.3, -0.075), (-2.0, -0.585)]
+)
+def test_error_is_rounded_at_zero_where_asked(e: float, expected: float) -> None:
+    """By hand: 0.3 e^2 / (2 * 0.1) below 0.1, and 0.3 (e - 0.05) above."""
+    price = rewards.params(PITCH, rewards.RewardConfig(huber=0.1 / 34.0))
+    zero = jnp.zeros(())
+    found = rewards.reward(price, jnp.asarray(e, float), zero, zero, zero, zero)
+    assert float(found) == pytest.approx(expected, rel=1e-5)
+    slope = jax.grad(lambda r: rewards.reward(price, r, zero, zero, zero, zero))(jnp.asarray(e, float))
+    assert float(slope) == pytest.approx(-0.3 * np.clip(e / 0.1, -1.0, 1.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(("move", "held", "expected"), [
+    (1.75, 30.0, -0.175), (1.75, 29.0, 0.0), (-1.75, 31.0, -0.175), (3.5, 30.0, -0.35), (0.0, 30.0, 0.0)
+])  # fmt: skip
+def test_small_moves_are_priced_where_r_rests(move: float, held: float, expected: float) -> None:
+    """By hand: 0.2 * 1.75^2 / 3.5, and as ever from 3.5 on."""
+    zero = jnp.zeros(())
+    price = rewards.params(PITCH, rewards.RewardConfig(rest=0.2))
+    found = rewards.reward(price, zero, zero, zero, jnp.asarray(move, float), zero, held=held)
+    assert float(found) == pytest.approx(expected)
+
+
+def test_a_plant_whose_moves_all_count_has_no_price_at_rest() -> None:
+    price = rewards.params(PITCH, rewards.RewardConfig(rest=0.2, rho_h=0.0))
+    zero = jnp.zeros(())
+    found = rewards.reward(price, zero, zero, zero, jnp.asarray(2.0, float), zero, held=50.0)
+    assert float(found) == pytest.approx(-0.2)

@@ -37,7 +37,7 @@ def controller(tmp_path_factory):
     if not any(map(shutil.which, c.COMPILERS)):
         pytest.skip("there is no C compiler")
     folder = tmp_path_factory.mktemp("exported")
-    run = RunFolder.create(small("pitch", residual=True), folder / "run")
+    run = RunFolder.create(small("pitch", base="static"), folder / "run")
     trainer, params = run.trainer
     run.save(0, 1, trainer.start(0, params))
     export.main([str(run.path), "--format", "fmu", "--out", str(folder / "outer.fmu")])

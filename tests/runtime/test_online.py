@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxouter.loop import references
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import affine
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.runtime.online import Live, declared
 from jaxouter.runtime.realtime import Loop, StepError, Timing, run
@@ -145,7 +145,7 @@ def test_a_missed_deadline_passes_r_and_is_counted():
     clock = Clock()
     plant = Lag(clock, taken={5: 0.6 * DT, 10: 1.2 * DT, 20: 2.7 * DT})
     live = tiny()
-    inverse = AffineParams(jnp.asarray(1 / 0.7, float), jnp.asarray(-1 / 0.7, float))
+    inverse = affine(1 / 0.7, -1 / 0.7)
     state = live.fresh(jax.random.key(0))._replace(begun=jnp.ones((), bool), base=inverse)
     loop, rows = ran(live, 30, plant, clock, state)
     assert [row.step for row in rows if row.why == "late"] == [10, 20]

@@ -115,7 +115,7 @@ def test_an_actor_pretrained_on_four_devices_is_that_of_one(tmp_path, monkeypatc
     start = PretrainingConfig(gradient_steps=3, episodes=8, lags=4, batch_size=16)
     actors = []
     for devices in (1, 4):
-        config = small("lag", pretraining=start, residual=True, steps=0, devices=devices)
+        config = small("lag", pretraining=start, base="static", steps=0, devices=devices)
         finals = train(RunFolder.create(config, tmp_path / str(devices)))
         assert finals is not None
         actors.append(finals[0].agent.actor)

@@ -12,6 +12,8 @@ TINY = [
     "--agent.hidden",
     "8",
     "8",
+    "--base",
+    "static",
 ]  # of the command
 
 
@@ -25,5 +27,5 @@ def small(plant: str = "heaters", name: str = "default", **changes) -> TrainConf
     base = preset(plant, name)
     of_agent = dict(hidden=(16, 16), batch_size=32, n_step=1, prefill=640, updates=1, replay=1_600)
     of_agent |= {f.name: changes.pop(f.name) for f in fields(base.agent) if f.name in changes}
-    own = dict(steps=3_040, epoch=960, environments=8, history=3, residual=False, pretraining=PretrainingConfig())
+    own = dict(steps=3_040, epoch=960, environments=8, history=3, base="absolute", pretraining=PretrainingConfig())
     return with_agent(replace(base, **{**own, **changes}), **of_agent)

@@ -24,7 +24,7 @@ def test_paper_preset_is_the_papers(plant, steps):
     config = preset(plant, "paper")
     agent = config.agent
     assert (config.steps, config.environments, agent.updates, agent.replay) == (steps, 1, 1, 1_000_000)
-    assert (agent.noise_theta, agent.noise_sigma, config.residual, config.redraw) == (0.15, (0.2, 0.2), False, 0.0)
+    assert (agent.noise_theta, agent.noise_sigma, config.base, config.redraw) == (0.15, (0.2, 0.2), "absolute", 0.0)
     assert config.total_updates == steps - agent.prefill
 
 

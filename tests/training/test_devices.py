@@ -26,7 +26,7 @@ from tests.training.small import small
 HERE = Path(__file__).parent
 OPTIONS = ["--steps", "1040", "--agent.prefill", "640", "--epoch", "8", "--environments", "8", "--agent.replay", "1600"]
 OPTIONS += ["--agent.hidden", "16", "16", "--agent.batch-size", "32", "--agent.updates", "1"]
-OPTIONS += ["--history", "3", "--no-residual"]
+OPTIONS += ["--history", "3", "--base", "absolute"]
 OPTIONS += ["--pretraining.gradient-steps", "0"]
 
 

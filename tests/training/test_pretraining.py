@@ -10,6 +10,7 @@ import pytest
 from jaxouter import plants
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.identification import counterfactual, records, steady_state
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.epochs import train
@@ -30,7 +31,7 @@ def registered(monkeypatch):
 
 @pytest.fixture
 def config():
-    return small("lag", pretraining=START, residual=True, steps=0)
+    return small("lag", pretraining=START, base="static", steps=0)
 
 
 def test_an_actor_from_a_record_alone_beats_the_static_prefilter(config):
@@ -115,7 +116,7 @@ def test_costs_count_by_their_logarithm_where_asked(config):
     white = Whitening(np.zeros(trainer.env.observer.size), np.eye(trainer.env.observer.size))
 
     def cost(log_above):
-        school = DifferentiableRollout(of_record, trainer.policy, 1, log_above=log_above)
+        school = DifferentiableRollout(TrainingEpisodes(of_record), trainer.policy, 1, log_above)
         return -float(
             school.train((actors, jax.vmap(ADAM.init)(actors)), white, base, model, np.zeros(1), KEY)[1][0, 0]
         )
@@ -125,13 +126,13 @@ def test_costs_count_by_their_logarithm_where_asked(config):
 
 def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
     trainer, _ = build(config)
-    school = DifferentiableRollout(trainer.env.plant, trainer.policy, noise=0.5, load=0.5)
+    episodes = TrainingEpisodes(trainer.env.plant, noise=0.5, load=0.5)
     keys = jax.random.split(jax.random.key(0), 400)
-    noise = np.asarray(jax.vmap(lambda key: school._noise(key, 50))(keys))
+    noise = np.asarray(jax.vmap(lambda key: episodes.noises(key, 50))(keys))
     level = noise.std(1)
     assert np.mean(level == 0) == pytest.approx(0.5, abs=0.08)
     assert 0.45 < np.sort(level)[-5] < 0.65
-    load = np.asarray(jax.vmap(lambda key: school._load(key, 50))(keys))
+    load = np.asarray(jax.vmap(lambda key: episodes.loads(key, 50))(keys))
     assert np.mean(np.all(load == 0, 1)) == pytest.approx(0.5, abs=0.08)
     assert 1.9 < np.abs(load).max() <= 2.0
     assert np.all((np.diff(load, axis=1) != 0).sum(1) <= 1)

@@ -28,7 +28,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_controller_from_a_log_is_better_on_the_true_plant(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plants.REGISTRY, "logged", lambda: recorded_data.make("logged", str(path)))
-    config = small("logged", pretraining=START, residual=True, steps=0)
+    config = small("logged", pretraining=START, base="static", steps=0)
     assert config.identification_steps == 0  # of the plant nothing more is asked
     trainer, params = build(config)
     state = trainer.start(0, params)

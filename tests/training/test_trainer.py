@@ -211,11 +211,12 @@ def test_a_diagnosis_tells_what_the_learner_expects_and_what_comes(filled):
     assert float(blind["return_start"]) == pytest.approx(np.mean(returns), rel=1e-4)
 
 
-def test_residual_starts_at_the_static_prefilter():
-    trainer, params = build(small("pitch", residual=True))
+def test_base_law_is_the_static_prefilter():
+    trainer, params = build(small("pitch", base="static"))
     state = trainer.start(0, params)
-    assert float(state.base.slope) == pytest.approx(3.0, rel=0.02)
-    r_tilde = trainer.policy.r_tilde(state.base, jnp.array(10.0), jnp.array(0.0))
+    assert float(state.base.r) == pytest.approx(3.0, rel=0.02)
+    ten, zero = jnp.array(10.0), jnp.array(0.0)
+    r_tilde = trainer.policy.r_tilde(state.base, trainer.env.observer.init(ten, zero), ten, zero, zero)
     assert float(r_tilde) == pytest.approx(30.0, rel=0.02)
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import cache as cache_of_functions
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import chex
 import jax
-import jax.numpy as jnp
 
 from jaxouter.evaluation import cache
-from jaxouter.evaluation.baselines import deepc, inverse, mpc, oracle, pi
+from jaxouter.evaluation.baselines import deepc, inverse, lq, mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import steady_state
-from jaxouter.loop.policy import Affine, AffineParams, Policy
+from jaxouter.loop.policy import Linear, Policy, affine
 from jaxouter.plants import Plant, make
 from jaxouter.plants.registry import attribute
 
@@ -46,20 +46,25 @@ def _none(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Rep
 def _static(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     identified = steady_state.dc_gain(plant, params, key)
     _, found = steady_state.prefilter(plant, identified)
-    settings = {"slope": float(found.slope), "offset": float(found.offset), "unsettled": identified.unsettled}
+    settings = {"slope": float(found.r), "offset": float(found.offset), "unsettled": identified.unsettled}
     return Tuned(settings, {}, steady_state.LEVELS * plant.episode_steps)
 
 
 def _affine(plant: Plant, tuned: Tuned) -> tuple[Policy, Any]:
     steady_state.warn_unsettled(tuned.settings.get("unsettled"))
-    slope, offset = (jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset"))
-    return Affine(plant.r_tilde_bounds), AffineParams(slope, offset)
+    return Linear(plant.r_tilde_bounds), affine(*(tuned.settings[name] for name in ("slope", "offset")))
 
 
 BASELINES: dict[str, Baseline] = {
     "none": Baseline("baseline", _none, _affine, "The inner loop alone: r~ = r."),
     "static": Baseline(
         "baseline", _static, _affine, "Inverse of the affine DC gain, from 8 constant-r~ episodes; r~ = r without one."
+    ),
+    "lq": Baseline(
+        "baseline", partial(lq.tune, "mae"), lq.build, "Linear-quadratic law of an ARX model, from a record."
+    ),
+    "lq-return": Baseline(
+        "baseline", partial(lq.tune, "return"), lq.build, "The same, chosen by the return instead of the MAE."
     ),
     "pi": Baseline("baseline", pi.tune, pi.build, "Static prefilter and PI with anti-windup, gains by COBYQA."),
     "mpc": Baseline(

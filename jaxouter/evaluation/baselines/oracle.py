@@ -22,11 +22,11 @@ from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned, cached
 from jaxouter.identification import counterfactual, dynamics
 from jaxouter.identification.steady_state import LEVELS, static
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw, affine
 from jaxouter.plants import Plant, make
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, folded, pretrain_on
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, folded, pretrain
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
@@ -42,13 +42,13 @@ VALIDATION = 512  # training episodes on which the best seed is chosen
 
 @partial(jax.jit, static_argnums=0)
 def returns(
-    rollout: DifferentiableRollout, actors: Any, base: AffineParams, plant_params: Any, key: chex.PRNGKey
+    rollout: DifferentiableRollout, actors: Any, base: LinearLaw, plant_params: Any, key: chex.PRNGKey
 ) -> jax.Array:
     """Mean return of each actor (seeds, ...) on `VALIDATION` episodes of the training distribution; (seeds,)."""
 
     def mean(actor: Any) -> jax.Array:
         keys = jax.random.split(key, VALIDATION)
-        each = jax.vmap(lambda key: rollout.episode(rollout.policy, LearnedParams(actor, base), plant_params, key)[0])
+        each = jax.vmap(lambda key: rollout.mean_reward(LearnedParams(actor, base), plant_params, key))
         return jnp.mean(each(keys)) * rollout.plant.episode_steps * rollout.plant.error_scale
 
     return jax.lax.map(mean, actors)
@@ -85,7 +85,7 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
         def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
             report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
 
-        actor = pretrain_on(start, plant, of_plant, trainer.policy, learned, keys, heard)
+        actor = pretrain(start, plant, of_plant, trainer.policy, learned, keys, heard)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
         return kept(actor, learned.base, {"gradient_steps": start.gradient_steps}, steps)
 
@@ -134,16 +134,16 @@ def train(rollout: DifferentiableRollout, params: Any, key: chex.PRNGKey, report
     return kept(best, base, settings, (SEEDS * gradient_steps * BATCH + LEVELS) * plant.episode_steps)
 
 
-def kept(actor: Any, base: AffineParams, settings: dict[str, Any], steps: int) -> Tuned:
+def kept(actor: Any, base: LinearLaw, settings: dict[str, Any], steps: int) -> Tuned:
     """What was found, as it is kept."""
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(actor).items()}
-    return Tuned({"slope": float(base.slope), "offset": float(base.offset)} | settings, arrays, steps)
+    return Tuned({"slope": float(base.r), "offset": float(base.offset)} | settings, arrays, steps)
 
 
 def learned(tuned: Tuned) -> LearnedParams:
     """The policy's parameters from what was found."""
     actor = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
-    base = AffineParams(*(jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset")))
+    base = affine(*(tuned.settings[name] for name in ("slope", "offset")))
     return LearnedParams(actor, base)
 
 

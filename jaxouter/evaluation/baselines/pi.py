@@ -15,14 +15,14 @@ from jaxouter.evaluation.baselines.tuning import Report, score, training_episode
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import steady_state
 from jaxouter.identification.steady_state import dc_gain, prefilter
-from jaxouter.loop.policy import AffineParams
+from jaxouter.loop.policy import LinearLaw, affine
 from jaxouter.plants import Plant
 
 
 class PIParams(NamedTuple):
     """r~ = offset + slope r + kp e + ki times the integral of e = r - y."""
 
-    base: AffineParams  # the static prefilter
+    base: LinearLaw  # the static prefilter
     kp: jax.Array
     ki: jax.Array  # 1 / time unit
 
@@ -48,7 +48,7 @@ class PI:
         low, high = self.r_tilde_bounds
         e = r - y
         integral = carry + e * self.control_step
-        wanted = params.base.offset + params.base.slope * r + params.kp * e + params.ki * integral
+        wanted = params.base.offset + params.base.r * r + params.kp * e + params.ki * integral
         further = ((wanted > high) & (params.ki * e > 0)) | ((wanted < low) & (params.ki * e < 0))
         return jnp.where(further, carry, integral), jnp.clip(wanted, low, high)
 
@@ -64,9 +64,9 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     key_static, key_episodes = jax.random.split(key)
     identified = dc_gain(plant, params, key_static)
     _, base = prefilter(plant, identified)
-    per_gain = float(base.slope)
+    per_gain = float(base.r)
     if identified.unsettled is not None:
-        base = AffineParams(jnp.zeros(()), jnp.asarray(identified.still, float))
+        base = affine(0.0, identified.still)
         per_gain = 1.0 / (identified.rate * plant.episode_steps)
     episodes = training_episodes(plant, params, key_episodes)
     policy, time = PI(plant.r_tilde_bounds, plant.control_step), plant.episode_steps * plant.control_step
@@ -91,7 +91,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     settings = {
         "kp": float(found.kp),
         "ki": float(found.ki),
-        "slope": float(base.slope),
+        "slope": float(base.r),
         "offset": float(base.offset),
     }
     return Tuned(settings, {}, spent + len(best) * each)
@@ -100,4 +100,4 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
 def build(plant: Plant, tuned: Tuned) -> tuple[PI, PIParams]:
     """The policy from what `tune` found."""
     slope, offset, kp, ki = (jnp.asarray(tuned.settings[name], float) for name in ("slope", "offset", "kp", "ki"))
-    return PI(plant.r_tilde_bounds, plant.control_step), PIParams(AffineParams(slope, offset), kp, ki)
+    return PI(plant.r_tilde_bounds, plant.control_step), PIParams(affine(slope, offset), kp, ki)

@@ -10,10 +10,11 @@ from jaxouter.evaluation.baselines import clairvoyant, mpc
 from jaxouter.evaluation.baselines.mpc import MPCSettings, innovations_form
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.evaluation.metrics import mae
-from jaxouter.evaluation.rollout import excess, rollout
+from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification.linear_models import ARX, choose_arx
 from jaxouter.identification.records import record
 from jaxouter.loop.policy import none
+from jaxouter.plants.base import excess
 from tests import kinds, lag
 
 KEY = jax.random.key(0)

@@ -86,7 +86,7 @@ def test_built_policy_is_the_one_that_was_chosen(tuned, rollout):
 @pytest.mark.slow
 def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_made_once():
     start = PretrainingConfig(gradient_steps=100, batch_size=16)
-    config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), residual=True, steps=0)
+    config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), base="static", steps=0)
     said = []
     found = oracle.retrained(config, lambda text, share: said.append((text, share)))
     assert said == [("50 of 100 gradient steps", 0.5), ("100 of 100 gradient steps", 1.0)]
@@ -115,8 +115,9 @@ def test_whitened_observations_have_nearly_unit_covariance(rollout, base, white)
     zero = jax.tree.map(jnp.zeros_like, rollout.policy.init_actor(KEY))
 
     def observed(key):
-        _, seen = rollout.episode(rollout.policy, LearnedParams(zero, base), lag.make()[1], key)
-        return jax.vmap(lambda carry, r, y: rollout.policy.observer.observe(carry, r, y)[1])(*seen)
+        seen = rollout.episodes.run(rollout.policy, LearnedParams(zero, base), lag.make()[1], key)
+        observe = jax.vmap(lambda memory, r, y: rollout.policy.observer.observe(memory, r, y)[1])
+        return observe(seen.memory, seen.r, seen.y_seen)
 
     obs = jax.jit(jax.vmap(observed))(jax.random.split(KEY, oracle.BATCH)).reshape(-1, rollout.policy.observer.size)
     whitened = np.asarray((obs - white.mean[None]) @ white.matrix, float)

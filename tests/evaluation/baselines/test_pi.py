@@ -14,7 +14,7 @@ from jaxouter.evaluation.baselines.pi import PI, PIParams
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import steady_state
-from jaxouter.loop.policy import AffineParams, none
+from jaxouter.loop.policy import affine, none
 from tests import kinds, lag
 from tests.precision import of_single_draws
 
@@ -51,7 +51,7 @@ def run(policy, params, e):
 
 def test_law_by_hand():
     policy = PI((-4.0, 4.0), 0.1)
-    params = PIParams(AffineParams(number(2.0), number(0.5)), number(3.0), number(10.0))
+    params = PIParams(affine(2.0, 0.5), number(3.0), number(10.0))
     r_tilde, integral = run(policy, params, [0.1, -0.2, 0.3])
     np.testing.assert_allclose(integral, [0.01, -0.01, 0.02], atol=1e-6)
     # 0.5 + 2 r + 3 e + 10 integral
@@ -65,7 +65,7 @@ def test_law_by_hand():
 def test_integral_stands_still_only_where_it_would_drive_further_beyond_a_bound(side, ki):
     """The prefilter alone is beyond the bound, e has the sign that leads further out or back in."""
     policy = PI((-1.0, 1.0), 0.1)
-    params = PIParams(AffineParams(number(0.0), number(2.0 * side)), number(0.0), number(ki))
+    params = PIParams(affine(0.0, 2.0 * side), number(0.0), number(ki))
     outwards = side * np.sign(ki)
     r_tilde, integral = run(policy, params, outwards * np.array([0.3, 0.2, -0.5, -0.5, -0.5]))
     np.testing.assert_allclose(integral, outwards * np.array([0.0, 0.0, -0.05, -0.1, -0.15]), atol=1e-6)

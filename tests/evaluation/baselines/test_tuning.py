@@ -9,7 +9,7 @@ import pytest
 
 from jaxouter.evaluation.baselines.tuning import coordinate_search, score, training_episodes
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.loop.policy import Affine, AffineParams, none
+from jaxouter.loop.policy import Linear, affine, none
 from tests import lag
 from tests.precision import makes_nan
 
@@ -73,7 +73,7 @@ def test_score_is_the_mean_return_and_minus_infinity_where_it_diverges(episodes)
     assert score(policy, params, episodes) == pytest.approx(rollout(policy, params, episodes).reward.sum(1).mean())
     one = replace(episodes, params=episodes.params.replace(K=episodes.params.K.at[7].set(jnp.nan)))
     assert score(policy, params, one) == -np.inf
-    assert score(Affine(PLANT.r_tilde_bounds), AffineParams(jnp.asarray(jnp.nan), jnp.zeros(())), episodes) == -np.inf
+    assert score(Linear(PLANT.r_tilde_bounds), affine(jnp.nan, 0.0), episodes) == -np.inf
 
 
 GRID = {"a": (1, 2, 4, 8, 16), "b": (0.1, 0.3, 1.0, 3.0), "c": ("low", "high")}

@@ -1,0 +1,48 @@
+"""`lq`: the LQ law of `jaxouter.identification.lq`, which learned policies have as their base law, by itself.
+
+`lq-return` is chosen by the return in place of the MAE.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import numpy as np
+
+from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.identification import dynamics, steady_state
+from jaxouter.identification.lq import Figure, choose, warn_short
+from jaxouter.identification.records import record, within
+from jaxouter.loop.policy import Linear, LinearLaw
+from jaxouter.plants import Plant
+from jaxouter.training.config import preset
+
+RECORD = 64  # episodes
+
+
+def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """The best law of a record, under the noise and loads of the learner's pretraining."""
+    del budget
+    key_explore, key_static, key_record, key_choose = jax.random.split(key, 4)
+    history, explored = dynamics.suitable_history(plant, params, key_explore)
+    _, static = steady_state.static(plant, params, key_static)
+    data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
+    report("choosing its law", 0.5)
+    start = preset(plant.name).pretraining
+    found = choose(plant, [data], static, key_choose, history, start.noise, start.load, figure)
+    law = LinearLaw(*(np.asarray(each, np.float64) for each in found.law))  # type: ignore[arg-type]
+    settings = {name: float(getattr(law, name)) for name in ("offset", "r", "y")}
+    settings |= {} if found.settings is None else found.settings._asdict()
+    settings |= {"mae": found.mae, "static_mae": found.static_mae, "most": found.most}
+    steps = explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size
+    return Tuned(settings, {"y_past": law.y_past, "r_tilde_past": law.r_tilde_past}, steps)
+
+
+def build(plant: Plant, tuned: Tuned) -> tuple[Linear, LinearLaw]:
+    """The policy from what `tune` found."""
+    warn_short(plant, tuned.settings["most"])
+    numbers = {name: tuned.settings[name] for name in ("offset", "r", "y")} | tuned.arrays
+    return Linear(plant.r_tilde_bounds), LinearLaw(**{name: jax.numpy.asarray(x, float) for name, x in numbers.items()})
