@@ -31,6 +31,9 @@ from jaxouter.training.run import RunFolder, add_agent
 PROCESSES = tuple(Processes.__dataclass_fields__)
 
 
+SIMPLE = {"none": "inner loop alone", "static": "static prefilter", "lq": "LQ law"}  # columns of the table
+
+
 @dataclass(frozen=True)
 class Options:
     """Train an outer loop on a plant (pitch, heaters or your own) and evaluate it.
@@ -167,11 +170,11 @@ def show(summary: TrainingSummary, config: TrainConfig) -> None:
             ours += f" ({number(min(values))}-{number(max(values))})"
         better = [figures.improvement for figures in of_seeds if figures.improvement is not None]
         printed = "-" if of_scenario is None else f"{of_scenario[1]:.2f} of {of_scenario[0]:.2f}"
-        inner, static = (by_name[simple][0][name].mae for simple in ("none", "static"))
-        row = [name, *([summary.places[name]] if placed else []), number(inner), number(static)]
+        simple = [number(by_name[each][0][name].mae) for each in SIMPLE if each in by_name]
+        row = [name, *([summary.places[name]] if placed else []), *simple]
         improvement = number(statistics.median(better), 3) if better else "-"
         rows.append([*row, *([printed] if of_paper else []), ours, improvement])
-    columns = ["scenario", *(["plant"] if placed else []), "inner loop alone", "static prefilter"]
+    columns = ["scenario", *(["plant"] if placed else []), *(SIMPLE[each] for each in SIMPLE if each in by_name)]
     columns += [*(["paper's DRL"] if of_paper else []), "ours", "improvement, %"]
     cli.table(f"MAE in {plants.make(config.plant)[0].y_unit}", columns, rows)
     if placed:

@@ -34,6 +34,7 @@ from jaxouter.evaluation.policies import (
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.verdict import judge
 from jaxouter.loop import rewards
+from jaxouter.loop.policy import Linear
 from jaxouter.plants import Plant, base, make, slug
 from jaxouter.plants.errors import PlantError
 from jaxouter.plants.registry import REGISTRATIONS, Maker, add, own_errors
@@ -352,7 +353,12 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     config, (trainer, params) = run.config, run.trainer
     plant = config.plant
     seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / config.side_by_side
-    identifiers, rollouts = scenarios.reported(plant), len(finals) + len(SIMPLE)
+    of_seeds = {seed: trainer.policy_params(state) for seed, state in finals.items()}
+    simple = {name: baseline(name, plant) for name in SIMPLE}
+    law = of_seeds[config.seed].base
+    if np.any(law.y_past):
+        simple["lq"] = NamedPolicy("lq", Linear(trainer.env.plant.r_tilde_bounds), law, plant)
+    identifiers, rollouts = scenarios.reported(plant), len(finals) + len(simple)
     if episodes is None:
         episodes = pace.affordable(identifiers, rollouts, seconds)
         if episodes is not None and episodes < scenarios.FAMILY_MEMBERS:
@@ -361,8 +367,6 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     selected = [scenarios.get(identifier, episodes) for identifier in identifiers]
     total = rollouts * sum(scenario.r.size for scenario in selected)
     progress.phase("evaluating", total, counter=counter([selected[0].plant]))
-    simple = {name: baseline(name, plant) for name in SIMPLE}
-    of_seeds = {seed: trainer.policy_params(state) for seed, state in finals.items()}
     policies = {seed: NamedPolicy("learned", trainer.policy, params, plant) for seed, params in of_seeds.items()}
 
     def evaluated(named: NamedPolicy, alone: Results | None) -> Results:

@@ -42,12 +42,13 @@ class _Inputs(NamedTuple):
     change: tuple[jax.Array, Any] | None
     sensor: SensorParams
     reward: RewardParams
+    load: jax.Array | None  # (T,), added to r~ at the plant
 
 
 def _axes(inputs: _Inputs) -> Any:
     """Which leaves have an axis of episodes, for vmap."""
     each = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, inputs.sensor)
-    axes: Any = (0, None if inputs.change is None else (None, 0), each, None)
+    axes: Any = (0, None if inputs.change is None else (None, 0), each, None, None if inputs.load is None else 0)
     return _Inputs(*axes)
 
 
@@ -75,8 +76,9 @@ def _advance(
     """One control step of the loop under r~, and what is recorded of it."""
     key_plant, key_sensor = jax.random.split(key)
     params, measure = parameters(inputs.params, inputs.change, k), partial(sensor.measure, inputs.sensor, key_sensor)
+    load = 0.0 if inputs.load is None else inputs.load[k]
     after, reward, _ = closed_loop.advance(
-        plant, params, inputs.reward, loop, r, r_tilde, key_plant, measure, _diverged
+        plant, params, inputs.reward, loop, r, r_tilde, key_plant, measure, _diverged, load
     )
     out = dict(y=after.y, r_tilde=after.r_tilde, reward=reward)
     if plant.members is not None:
@@ -124,7 +126,8 @@ def some(scenario: Scenario, first: int, end: int) -> Scenario:
     change = None if scenario.change is None else (scenario.change[0], _some(scenario.change[1], first, end))
     sensor = jax.tree.map(lambda leaf: leaf[first:end] if jnp.ndim(leaf) else leaf, scenario.sensor)
     episodes = {name: _some(getattr(scenario, name), first, end) for name in ("params", "r", "keys")}
-    return replace(scenario, change=change, sensor=sensor, **episodes)
+    load = None if scenario.load is None else scenario.load[first:end]
+    return replace(scenario, change=change, sensor=sensor, load=load, **episodes)
 
 
 def _some(tree: Any, first: int, end: int) -> Any:
@@ -160,7 +163,7 @@ def rollout(
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
     plant = scenario.plant
     change = None if scenario.change is None else (jnp.asarray(scenario.change[0]), scenario.change[1])
-    inputs = _Inputs(scenario.params, change, scenario.sensor, rewards.params(plant))
+    inputs = _Inputs(scenario.params, change, scenario.sensor, rewards.params(plant), scenario.load)
     run = _host_rollout if policy.host else _rollout
     y0, out = run(plant, policy, record_members, per_episode, policy_params, inputs, scenario.r, scenario.keys)
     out = {name: np.asarray(value) for name, value in out.items()}
@@ -179,7 +182,7 @@ def rollout(
 
 def outputs(policy: Policy, policy_params: Any, scenario: Scenario) -> jax.Array:
     """Y (episodes, T) as in `rollout`, of a JAX policy, within a function that is compiled."""
-    inputs = _Inputs(scenario.params, None, scenario.sensor, rewards.params(scenario.plant))
+    inputs = _Inputs(scenario.params, None, scenario.sensor, rewards.params(scenario.plant), scenario.load)
     return _rollout(scenario.plant, policy, False, False, policy_params, inputs, scenario.r, scenario.keys)[1]["y"]
 
 

@@ -40,6 +40,7 @@ class Scenario:
     stable_alone: bool = True  # the inner loop alone is stable
     change: tuple[int, Any] | None = None  # from this control step on, these parameters
     sensor: SensorParams = field(default_factory=sensors.params)  # each leaf a number for all, or (episodes,)
+    load: jax.Array | None = None  # (episodes, T), added to r~ at the plant; nobody sees it
     paper: tuple[float, float] | None = None  # MAE in the paper: inner loop alone, its DRL
 
 

@@ -77,12 +77,15 @@ class TrainingEpisodes:
         begin = begun, policy.init(policy_params, r[0], begun.y + noise[0])
         return jax.lax.scan(step, begin, (r, held(r).astype(r.dtype), noise, load, jax.random.split(key_run, steps)))[1]
 
+    def level(self, key: chex.PRNGKey) -> jax.Array:
+        """Standard deviation of an episode's measurement noise."""
+        low, high = self.plant.setpoint_range
+        return self.noise * (high - low) / 2 * jnp.maximum(0.0, jax.random.uniform(key, (), float, -1.0, 1.0))
+
     def noises(self, key: chex.PRNGKey, steps: int) -> jax.Array:
         """Measurement noise (steps,)."""
         key_level, key_run = jax.random.split(key)
-        low, high = self.plant.setpoint_range
-        level = jnp.maximum(0.0, jax.random.uniform(key_level, (), float, -1.0, 1.0))
-        return self.noise * (high - low) / 2 * level * jax.random.normal(key_run, (steps,), float)
+        return self.level(key_level) * jax.random.normal(key_run, (steps,), float)
 
     def loads(self, key: chex.PRNGKey, steps: int) -> jax.Array:
         """Load on r~ (steps,): zero, then constant from a random time on."""

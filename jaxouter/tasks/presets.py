@@ -14,7 +14,7 @@ DEFAULT: Options = {
     "base": "lq",
     "reward_scale": 0.1,
     "reward.huber": 0.003,
-    "reward.rest": 0.2,
+    "reward.rest": 0.05,
     "integral_steps": 20.0,
     "pretraining.gradient_steps": 1_500,
     "pretraining.noise": 0.015,

@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxouter.evaluation.baselines.mpc import RECORD, horizons_for, late
 from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differences, limit_rows
-from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, score, training_episodes
+from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification.linear_models import HORIZON, choose_arx
 from jaxouter.identification.records import Record, record
@@ -43,6 +43,7 @@ class DeePCSettings(NamedTuple):
     move_weight: float  # of squared moves of r~, in squared errors that their DC effect would be
     g_weight: float  # w_g over the number of windows, in mean squares of y
     margin: float  # kept from the limits, in standard deviations of the one-step prediction
+    noise: float  # added to y of the record, standard deviation as share of the set-point range
 
 
 class Carry(NamedTuple):
@@ -92,7 +93,8 @@ def windows(data: Record, past: int, horizon: int) -> tuple[np.ndarray, np.ndarr
 def controller(plant: Plant, data: Record, gain: float, settings: DeePCSettings) -> DeePC:
     """The controller that a record gives, its costs scaled by the DC gain of the plant."""
     past, horizon = settings.past, settings.horizon
-    given, future = windows(data, past, horizon)
+    noise = settings.noise * np.ptp(plant.setpoint_range) * np.random.default_rng(0).normal(size=data.y.shape)
+    given, future = windows(data._replace(y=data.y + noise), past, horizon)
     count = given.shape[1]
     L = np.asarray(np.linalg.qr(np.vstack([given, future]).T / np.sqrt(count), mode="r")).T
     L11, L21, L22 = L[: len(given), : len(given)], L[len(given) :, : len(given)], L[len(given) :, len(given) :]
@@ -120,17 +122,25 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     data = record(plant, params, key_record, RECORD)
     gain = float(dc_gain(plant, params, key_record).gain)
     dead = choose_arx(data, round(HORIZON * plant.episode_steps)).dead
-    episodes = training_episodes(plant, params, key_episodes)
+    episodes = learners_episodes(plant, params, key_episodes)
     spent = data.r_tilde.size + LEVELS * plant.episode_steps
     horizons, beyond = horizons_for(plant, dead), late(plant, dead)
     grid = {
         "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
         "g_weight": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0),
+        "noise": (0.0, 1e-3, 3e-3, 1e-2),
         "past": [beyond + past for past in (1, 2, 3, 5, 8, 12, 16, 20)],
         "horizon": horizons,
         "margin": (0.0, 1.0, 2.0, 3.0),
     }
-    start = {"move_weight": 0.1, "g_weight": 1e-2, "past": beyond + 12, "horizon": horizons[2], "margin": 1.0}
+    start = {
+        "move_weight": 0.1,
+        "g_weight": 1e-2,
+        "noise": 3e-3,
+        "past": beyond + 12,
+        "horizon": horizons[2],
+        "margin": 1.0,
+    }
 
     def value(settings: dict[str, Any]) -> float:
         return score(controller(plant, data, gain, DeePCSettings(**settings)), (), episodes)

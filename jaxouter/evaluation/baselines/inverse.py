@@ -23,14 +23,17 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.networks import Actor
-from jaxouter.evaluation.baselines.tuning import Report, score, training_episodes
+from jaxouter.evaluation.baselines.tuning import Report, learner, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import dynamics, records
+from jaxouter.identification.records import Record
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.plants import Plant
 
 HIDDEN = (128, 128)
 BATCH, UPDATES, RATE = 256, 6_000, 2e-3
+NOISE = 1  # folded into a key
 CANDIDATES = 8  # values of h tried, geometric from 1 to a quarter of an episode
 
 
@@ -99,11 +102,13 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """A network for each of some h, on a record as long as the budget allows; the one with the greatest return."""
     key_record, key_fit, key_episodes = jax.random.split(key, 3)
+    key_noise = jax.random.fold_in(key, NOISE)
     history, explored = dynamics.suitable_history(plant, params, key_record)
-    episodes = training_episodes(plant, params, key_episodes)
+    episodes = learners_episodes(plant, params, key_episodes)
     tried = sorted({round(h) for h in np.geomspace(1, plant.episode_steps / 4, CANDIDATES)})
     spent = explored + len(tried) * episodes.r.size
     data = records.record(plant, params, key_record, (budget - spent) // plant.episode_steps)
+    data = data._replace(y=data.y + _noise(plant, data, key_noise))
     policy = Inverse(Observer.of(plant, history))
     best: tuple[float, int, Any] | None = None
     for i, h in enumerate(tried):
@@ -114,6 +119,13 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     assert best is not None
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(best[2]).items()}
     return Tuned({"h": best[1], "updates": UPDATES, "history": history}, arrays, data.r_tilde.size + spent)
+
+
+def _noise(plant: Plant, data: Record, key: chex.PRNGKey) -> np.ndarray:
+    """The measurement noise of the learner's episodes, for a record."""
+    episodes = TrainingEpisodes(plant, learner(plant).pretraining.noise)
+    keys, steps = jax.random.split(key, len(data.y)), data.y.shape[1]
+    return np.asarray(jax.vmap(lambda key: episodes.noises(key, steps))(keys), np.float64)
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[Inverse, Any]:

@@ -11,14 +11,13 @@ import chex
 import jax
 import numpy as np
 
-from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import dynamics, steady_state
 from jaxouter.identification.lq import Figure, choose, warn_short
 from jaxouter.identification.records import record, within
 from jaxouter.loop.policy import Linear, LinearLaw
 from jaxouter.plants import Plant
-from jaxouter.training.config import preset
 
 RECORD = 64  # episodes
 
@@ -31,14 +30,14 @@ def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: i
     _, static = steady_state.static(plant, params, key_static)
     data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("choosing its law", 0.5)
-    start = preset(plant.name).pretraining
+    start = learner(plant).pretraining
     found = choose(plant, [data], static, key_choose, history, start.noise, start.load, figure)
     law = LinearLaw(*(np.asarray(each, np.float64) for each in found.law))  # type: ignore[arg-type]
     settings = {name: float(getattr(law, name)) for name in ("offset", "r", "y")}
     settings |= {} if found.settings is None else found.settings._asdict()
     settings |= {"mae": found.mae, "static_mae": found.static_mae, "most": found.most}
     steps = explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size
-    return Tuned(settings, {"y_past": law.y_past, "r_tilde_past": law.r_tilde_past}, steps)
+    return Tuned(settings, {name: np.asarray(getattr(law, name)) for name in ("y_past", "r_tilde_past")}, steps)
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[Linear, LinearLaw]:

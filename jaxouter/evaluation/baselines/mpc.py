@@ -16,14 +16,13 @@ import numpy as np
 import scipy.linalg
 
 from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differences, limit_rows
-from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, score, training_episodes
+from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification.linear_models import ARX, HORIZON, choose_arx
 from jaxouter.identification.records import record, within
 from jaxouter.plants import Plant
 
 RECORD = 50  # episodes of the record
-NOISE = 1e-3  # of the sensor that the observer expects, standard deviation as share of the range of set-points
 
 
 class Model(NamedTuple):
@@ -67,6 +66,7 @@ class MPCSettings(NamedTuple):
     move_weight: float  # of squared moves of r~, in squared errors that their DC effect would be
     disturbance: float  # standard deviation of its step, as share of the range of r~
     margin: float  # kept from the limits, in standard deviations of e
+    noise: float  # of the sensor that the observer expects, standard deviation as share of the set-point range
 
 
 class MPCParams(NamedTuple):
@@ -138,7 +138,7 @@ def observer(
 def controller(plant: Plant, model: Model, sigma: float, settings: MPCSettings) -> MPC:
     """The controller of a model."""
     span, width = np.diff(plant.setpoint_range)[0], np.diff(plant.r_tilde_bounds)[0]
-    A, B, C, K = observer(model, sigma, settings.disturbance * width, NOISE * span)
+    A, B, C, K = observer(model, sigma, settings.disturbance * width, settings.noise * span)
     horizon, moves = settings.horizon, blocks(settings.horizon)
     powers = [C]
     for _ in range(horizon - 1):
@@ -177,15 +177,16 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     arx = choose_arx(data, round(HORIZON * plant.episode_steps))
     horizons = horizons_for(plant, arx.dead)
     model = innovations_form(arx)
-    episodes = training_episodes(plant, params, key_episodes)
+    episodes = learners_episodes(plant, params, key_episodes)
     most = (budget - data.r_tilde.size) // episodes.r.size
     grid = {
         "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
         "disturbance": (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1),
+        "noise": (3e-4, 1e-3, 3e-3, 1e-2, 3e-2),
         "horizon": horizons,
         "margin": (0.0, 1.0, 2.0, 3.0),
     }
-    start = {"move_weight": 0.1, "disturbance": 1e-3, "horizon": horizons[2], "margin": 1.0}
+    start = {"move_weight": 0.1, "disturbance": 1e-3, "noise": 3e-3, "horizon": horizons[2], "margin": 1.0}
 
     def value(settings: dict[str, Any]) -> float:
         return score(controller(plant, model, arx.sigma, MPCSettings(**settings)), (), episodes)

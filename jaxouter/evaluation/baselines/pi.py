@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from jaxouter.evaluation.baselines.tuning import Report, score, training_episodes
+from jaxouter.evaluation.baselines.tuning import Report, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import steady_state
 from jaxouter.identification.steady_state import dc_gain, prefilter
@@ -68,7 +68,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     if identified.unsettled is not None:
         base = affine(0.0, identified.still)
         per_gain = 1.0 / (identified.rate * plant.episode_steps)
-    episodes = training_episodes(plant, params, key_episodes)
+    episodes = learners_episodes(plant, params, key_episodes)
     policy, time = PI(plant.r_tilde_bounds, plant.control_step), plant.episode_steps * plant.control_step
     spent, each = steady_state.LEVELS * plant.episode_steps, episodes.r.size
     most = (budget - spent) // each

@@ -1,4 +1,4 @@
-"""What tuning a baseline takes: episodes of the training distribution, the return on them, and searches."""
+"""What tuning a baseline takes: the episodes and the reward that the learner is trained on, and searches."""
 
 from __future__ import annotations
 
@@ -8,23 +8,45 @@ from typing import Any
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxouter.evaluation.metrics import trained_return
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import sensor
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import Policy
 from jaxouter.loop.references import redrawn
 from jaxouter.plants import Plant
+from jaxouter.training.config import TrainConfig, preset
 
 EPISODES = 16
+DISTURBED = 1  # folded into a key
 Report = Callable[[str, float], None]
 """Told now and then what was done, and which share of the work that is, at least."""
 
 
-def training_episodes(plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES) -> Scenario:
-    """Episodes of the training distribution as a scenario: starts of training, set-points of the plant's range."""
+def learner(plant: Plant) -> TrainConfig:
+    """The plant's default preset, whose noise, loads and reward the baselines are tuned on."""
+    return preset(plant.name)
+
+
+def training_episodes(
+    plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES, noise: float = 0.0, load: float = 0.0
+) -> Scenario:
+    """Episodes of the training distribution as a scenario: starts of training, set-points of the plant's range.
+
+    Args:
+        plant, params, key: of the episodes.
+        episodes: how many.
+        noise, load: see `TrainingEpisodes`.
+    """
     key_r, key_draw, key_run = jax.random.split(key, 3)
+    disturbed = TrainingEpisodes(plant, noise, load)
+    key_level, *keys_load = jax.random.split(jax.random.fold_in(key, DISTURBED), 1 + episodes)
+    levels = jax.vmap(disturbed.level)(jax.random.split(key_level, episodes))
+    loads = jax.vmap(lambda key: disturbed.loads(key, plant.episode_steps))(jnp.stack(keys_load))
     r = jax.vmap(lambda key: redrawn(key, plant.episode_steps, *plant.setpoint_range))(
         jax.random.split(key_r, episodes)
     )
@@ -35,14 +57,24 @@ def training_episodes(plant: Plant, params: Any, key: chex.PRNGKey, episodes: in
         params=jax.vmap(draw, (0, None), axis_size=episodes)(jax.random.split(key_draw, episodes), params),
         r=r,
         keys=jax.random.split(key_run, episodes),
-        sensor=sensor.params(),
+        sensor=replace(sensor.params(), noise=levels) if noise else sensor.params(),
+        load=loads if load else None,
     )
 
 
+def learners_episodes(plant: Plant, params: Any, key: chex.PRNGKey) -> Scenario:
+    """Training episodes with the noise and the loads of the learner's pretraining."""
+    start = learner(plant).pretraining
+    return training_episodes(plant, params, key, noise=start.noise, load=start.load)
+
+
 def score(policy: Policy, params: Any, episodes: Scenario) -> float:
-    """Mean return, of which each policy seeks the greatest; -inf where y is not finite."""
-    reward = rollout(policy, params, episodes).reward
-    return float(np.mean(reward.sum(1))) if np.all(np.isfinite(reward)) else -np.inf
+    """Mean return in the reward that the learner is trained on, of which each policy seeks the greatest.
+
+    It is -inf where y is not finite.
+    """
+    found = trained_return(rollout(policy, params, episodes), episodes.plant, learner(episodes.plant).reward)
+    return -np.inf if found is None else found
 
 
 def coordinate_search(

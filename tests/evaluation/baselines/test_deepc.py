@@ -17,7 +17,7 @@ from tests import lag
 
 KEY = jax.random.key(0)
 PAST, HORIZON, GAIN = 6, 10, 0.5
-SETTINGS = DeePCSettings(PAST, HORIZON, move_weight=0.01, g_weight=1.0, margin=1.0)
+SETTINGS = DeePCSettings(PAST, HORIZON, move_weight=0.01, g_weight=1.0, margin=1.0, noise=0.0)
 BUDGET = 2_500 + 400 + 10 * 800
 
 
@@ -33,7 +33,7 @@ def noisy(data):
 
 def like(settings, data):
     """mpc with the same costs on the exact model."""
-    wanted = mpc.MPCSettings(settings.horizon, settings.move_weight, 1e-3, settings.margin)
+    wanted = mpc.MPCSettings(settings.horizon, settings.move_weight, 1e-3, settings.margin, 1e-3)
     return mpc.controller(lag.LAG, mpc.innovations_form(fit_arx(data, 2, 2)), 0.0, wanted)
 
 

@@ -21,7 +21,7 @@ KEY = jax.random.key(0)
 # K = 0.5, T = 0.3 s, d = 2.5 steps: two steps pass, then r~ jumps in the middle of a step.
 HALF = np.exp(-0.05 / 0.3)
 TRUE = ARX(np.array([HALF**2, 0.0]), 0.5 * (1 - HALF) * np.array([1.0, HALF]), 0.0, 2, 1e-6)
-SETTINGS = MPCSettings(horizon=10, move_weight=0.01, disturbance=1e-3, margin=1.0)
+SETTINGS = MPCSettings(horizon=10, move_weight=0.01, disturbance=1e-3, margin=1.0, noise=1e-3)
 BUDGET = 2_500 + 12 * 800
 
 

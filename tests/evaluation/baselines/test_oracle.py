@@ -60,7 +60,7 @@ def test_it_is_as_good_as_pi_and_mpc(tuned):
     assert reached > 1.03 * score(*pi.build(plant, pi_tuned), episodes)
     exact = mpc.innovations_form(linear_models.fit_arx(records.record(plant, params, KEY, 4), 2, 2))
     for move_weight in (1e-4, 1e-3, 1e-2):
-        controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0))
+        controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0, 1e-3))
         assert reached > 1.03 * score(controller, (), episodes)
 
 

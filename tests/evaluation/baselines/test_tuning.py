@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.evaluation.baselines.tuning import coordinate_search, score, training_episodes
+from jaxouter.evaluation.baselines.tuning import coordinate_search, learners_episodes, score, training_episodes
+from jaxouter.evaluation.metrics import trained_return
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.loop.policy import Linear, affine, none
+from jaxouter.training.config import preset
 from tests import lag
 from tests.precision import makes_nan
 
@@ -68,12 +70,28 @@ def test_start_and_parameters_are_those_of_training(episodes):
 
 
 @makes_nan
-def test_score_is_the_mean_return_and_minus_infinity_where_it_diverges(episodes):
+def test_score_is_the_mean_return_that_the_learner_is_trained_on_and_minus_infinity_where_it_diverges(episodes):
     policy, params = none(PLANT)
-    assert score(policy, params, episodes) == pytest.approx(rollout(policy, params, episodes).reward.sum(1).mean())
+    traces = rollout(policy, params, episodes)
+    assert score(policy, params, episodes) == trained_return(traces, PLANT, preset("lag").reward)
+    assert score(policy, params, episodes) > traces.reward.sum(1).mean()  # errors are rounded at zero
     one = replace(episodes, params=episodes.params.replace(K=episodes.params.K.at[7].set(jnp.nan)))
     assert score(policy, params, one) == -np.inf
     assert score(Linear(PLANT.r_tilde_bounds), affine(jnp.nan, 0.0), episodes) == -np.inf
+
+
+def test_baselines_meet_the_noise_and_the_loads_of_the_learner():
+    found = learners_episodes(PLANT, lag.make()[1], KEY)
+    start, noise, load = preset("lag").pretraining, np.asarray(found.sensor.noise), np.asarray(found.load)
+    assert 0.0 < noise.max() <= start.noise * SPAN / 2
+    assert 0.2 < np.mean(noise == 0.0) < 0.8
+    assert load.shape == found.r.shape
+    assert 0.0 < np.abs(load).max() <= start.load * np.ptp(PLANT.r_tilde_bounds) / 2
+    assert 0.2 < np.mean(np.all(load == 0.0, axis=1)) < 0.8
+    policy, params = none(PLANT)
+    alike = rollout(policy, params, replace(found, load=None))
+    assert not np.array_equal(rollout(policy, params, found).y, alike.y)
+    np.testing.assert_array_equal(rollout(policy, params, found).r_tilde, alike.r_tilde)
 
 
 GRID = {"a": (1, 2, 4, 8, 16), "b": (0.1, 0.3, 1.0, 3.0), "c": ("low", "high")}
