@@ -23,9 +23,10 @@ from jaxouter.terminal import console
 class Options:
     """Compare policies with their baselines, with the limit and with a lower bound, and write a report.
 
-    Baselines (none, static, pi, mpc, deepc, inverse) are identified and tuned on the training distribution of the
-    plant, through r~ and y alone; `oracle` is the limit for policies without preview, `clairvoyant` a lower bound
-    with preview. Their results are computed once and kept in the cache folder; the first time takes minutes.
+    Baselines (none, static, lq, lq-return, pi, mpc, deepc, inverse) are identified and tuned on the training
+    distribution of the plant, through r~ and y alone. The limit is the least MAE of `oracle`, `lq-exact`, `mpc-exact`,
+    which are made from the true plant, `none` and `static`; `clairvoyant` is a lower bound, with preview. Their
+    results are computed once and kept in the cache folder; the first time takes minutes.
     """
 
     plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
@@ -81,7 +82,7 @@ def show(content: Comparison) -> None:
     columns, rows = statistics.table(content.rows, content.policies, best)
     cli.table(f"MAE, {content.y_unit}", columns, rows)
     legend = {
-        " (": "In brackets: ratio to the limit (oracle).",
+        " (": "In brackets: ratio to the limit, the least MAE of policies made from the true plant.",
         "[bold]": "Bold: best without the model.",
         "*": "*: best without the model.",
         "!": "!: outside the limits of the plant.",

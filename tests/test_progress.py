@@ -348,7 +348,7 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
     evaluation.named("oracle", "pitch", of)
     identifying, told, tuning = out.getvalue().splitlines()
     assert (identifying, tuning) == ("identifying oracle", "tuning oracle")
-    assert told.startswith("oracle on pitch: The learner's actor, trained by back-propagation through the simulator.")
+    assert told.startswith("oracle on pitch: A correction of lq-exact by the learner's network, trained by")
     assert said == ["tuning oracle  30% of it  30 %  0:35 left"]
 
 

@@ -43,6 +43,8 @@ STYLES = {  # after Okabe and Ito, which the colour-blind tell apart; line and m
     "deepc": Style("#d55e00", DASHDOTDOT, "v"),
     "inverse": Style("#7b5bb5", DASHED, "P"),
     "oracle": Style("#111111", DASHED, "*", 1.5, 4.0),
+    "lq-exact": Style("#555555", DASHED, "1", 1.5, 4.0),
+    "mpc-exact": Style("#555555", DASHDOT, "2", 1.5, 4.0),
     "clairvoyant": Style("#111111", DOTTED, "d", 1.5, 4.0),
 }
 LEARNED = (  # further runs of the learned policy

@@ -30,7 +30,7 @@ from msgspec.structs import asdict
 
 from jaxouter import terminal
 from jaxouter.evaluation import cache, scenarios, stability, sweeps
-from jaxouter.evaluation.baselines import CLAIRVOYANT, NAMES, OWN, Baseline, Kind, identified, resolve
+from jaxouter.evaluation.baselines import CLAIRVOYANT, LIMITS, NAMES, OWN, SIMPLE, Baseline, Kind, identified, resolve
 from jaxouter.evaluation.baselines.clairvoyant import Replay, plan
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
@@ -49,8 +49,16 @@ SET_POINTS = 19  # of the stability analysis, over the range of evaluation
 LEARNED_NOTE = "The learned outer loop, without exploration."
 TRACES = ("y0", "r", "y", "r_tilde")  # that are kept
 Labels = Mapping[tuple[str, str | None], str]  # of the lines, by policy and run
-IDENTIFY = {"oracle": 90.0, "inverse": 30.0, "mpc": 60.0, "deepc": 90.0, "pi": 15.0}  # about seconds that it takes
-NEEDS = {"oracle": "differentiable", CLAIRVOYANT: "affine"}  # what the plant must be declared
+IDENTIFY = {
+    "oracle": 300.0,
+    "mpc-exact": 60.0,
+    "inverse": 30.0,
+    "mpc": 60.0,
+    "deepc": 90.0,
+    "pi": 15.0,
+    "lq": 5.0,
+}  # about seconds that it takes
+NEEDS = {**dict.fromkeys(LIMITS, "differentiable"), CLAIRVOYANT: "affine"}  # what the plant must be declared
 PREVIEW_NOTE = "Least MAE of any r~, with preview: knows plant, state, noise and the whole reference."
 
 
@@ -375,16 +383,20 @@ def rows(done: Sequence[Done]) -> list[Row]:
     """A row for each policy, seed and scenario, with its ratios to the limit, the bound and the inner loop alone."""
     selected = [(d, msgspec.convert(d.found.settings, FiguresOfMerit)) for d in done if d.job.what == "evaluate"]
     static = {d.job.on: d.found.arrays["mae"] for d, _ in selected if d.job.entrant.name == "static"}
-    reference = {(d.job.entrant.name, d.job.on): figures.mae for d, figures in selected}
+    by_scenario: dict[str, dict[str, FiguresOfMerit]] = {}
+    for d, figures in selected:
+        by_scenario.setdefault(d.job.on, {})[d.job.entrant.name] = figures
+    reference = {(name, on): figures.mae for on, each in by_scenario.items() for name, figures in each.items()}
 
-    def over(mae: float | None, name: str, on: str) -> float | None:
-        against = reference.get((name, on))
+    limits = {on: limit(each) for on, each in by_scenario.items()}
+
+    def over(mae: float | None, against: float | None) -> float | None:
         return None if mae is None or not against else mae / against
 
     found = []
     for d, figures in selected:
         c, on, mae, outside = d.job.entrant, d.job.on, figures.mae, figures.violation_time
-        alone = over(mae, "none", on) if d.found.settings["stable_alone"] else None
+        alone = over(mae, reference.get(("none", on))) if d.found.settings["stable_alone"] else None
         others: dict[str, Any] = asdict(figures)
         others["improvement"] = None if alone is None else 100.0 * (1.0 - alone)
         row = Row(
@@ -392,14 +404,26 @@ def rows(done: Sequence[Done]) -> list[Row]:
             run=c.line[1],
             seed=c.seed,
             scenario=on,
-            ratio_to_limit=over(mae, "oracle", on),
-            ratio_to_bound=over(mae, CLAIRVOYANT, on),
-            within_limits=mae is not None and (outside is None or outside <= WITHIN),
+            ratio_to_limit=over(mae, limits[on]),
+            ratio_to_bound=over(mae, reference.get((CLAIRVOYANT, on))),
+            within_limits=mae is not None and (outside or 0.0) <= WITHIN,
             worse_than_static=float(np.mean(~(d.found.arrays["mae"] <= static[on]))) if on in static else None,
             **others,
         )
         found.append(row)
     return found
+
+
+def limit(figures: Mapping[str, FiguresOfMerit]) -> float | None:
+    """The least MAE of the privileged policies of a scenario that leave the plant's limits no more than allowed.
+
+    Where all leave them, of those that do so least. None where there is none of them but `none` and `static`.
+    """
+    if not any(name in figures for name in LIMITS):
+        return None
+    known = [each for name, each in figures.items() if name in (*LIMITS, *SIMPLE) and each.mae is not None]
+    allowed = max(WITHIN, min((each.violation_time or 0.0 for each in known), default=0.0))
+    return min((each.mae or 0.0 for each in known if (each.violation_time or 0.0) <= allowed), default=None)
 
 
 def first_episodes(done: Sequence[Done], on: str) -> dict[Entrant, Traces]:

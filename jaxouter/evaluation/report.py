@@ -42,7 +42,10 @@ select.addEventListener("change", show);
 show();
 """
 TERMS = (
-    ("limit", "a policy with the same network and observation, trained by back-propagation through the simulator"),
+    (
+        "limit",
+        "the least MAE of the policies within the limits that are made from the true plant, and of r̃ = r and static",
+    ),
     ("with preview", "the least error of any r̃ within the bounds, knowing plant, state, noise and the whole reference"),
     ("outside the limits", "the limit of y, or of its change, is left in more than 0.1 % of the steps"),
     ("rank", "by MAE, among the learned, the users' and the baseline policies that keep the limits and do not diverge"),

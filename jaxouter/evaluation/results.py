@@ -33,7 +33,7 @@ class Row(FiguresOfMerit, frozen=True):
     run: str | None  # folder
     seed: int | None
     scenario: str
-    ratio_to_limit: float | None  # MAE over that of the oracle
+    ratio_to_limit: float | None  # MAE over the limit
     ratio_to_bound: float | None  # MAE over that of the policy with preview
     within_limits: bool
     worse_than_static: float | None  # share of the episodes whose MAE is above that of `static`

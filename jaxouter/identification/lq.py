@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import chex
 import jax
@@ -20,7 +20,6 @@ import numpy as np
 import scipy.linalg
 
 from jaxouter.identification import counterfactual
-from jaxouter.identification.counterfactual import CounterfactualParams
 from jaxouter.identification.records import Record
 from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.loop.episodes import TrainingEpisodes
@@ -192,6 +191,7 @@ def choose(
     noise: float,
     load: float,
     figure: Figure = "mae",
+    on: Any = None,
 ) -> Choice:
     """The best LQ law on held-out episodes of the records' own models.
 
@@ -208,6 +208,7 @@ def choose(
         history: past samples that show the state of the plant and its dead time.
         noise, load: of these episodes, see `TrainingEpisodes`.
         figure: what is best.
+        on: parameters of the plant, to compare the laws on the plant itself; None: on the record's own model.
     """
     whole = Record(*map(np.concatenate, zip(*data, strict=True)))
     steps, wanted = whole.r_tilde.shape[1], lags_for(plant, history)
@@ -219,8 +220,11 @@ def choose(
     held_out = [jax.tree.map(lambda leaf: leaf[3 * len(leaf) // 4 :], model) for model in models]
     settings, laws = zip(*_candidates(plant, whole, tried), strict=True)
     together = jax.tree.map(lambda *each: jnp.stack(each), *(padded(each, max(tried)) for each in (static, *laws)))
-    episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), noise, load)
-    replayed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *held_out)
+    if on is None:
+        episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), noise, load)
+        replayed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *held_out)
+    else:
+        episodes, replayed = TrainingEpisodes(plant, noise, load), on
     mae, reward, outside = (np.asarray(each, np.float64) for each in _compared(episodes, together, replayed, key))
     responses = [[np.asarray(each[0], np.float64) for each in (model.a, model.b)] for model in models[:PLANTS]]
     numbers = jax.tree.map(lambda each: np.asarray(each, np.float64), together)
@@ -257,7 +261,7 @@ def _candidates(plant: Plant, data: Record, lags: Sequence[int]) -> Iterator[tup
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
 def _compared(
-    episodes: TrainingEpisodes, laws: LinearLaw, params: CounterfactualParams, key: chex.PRNGKey
+    episodes: TrainingEpisodes, laws: LinearLaw, params: Any, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """MAE, mean reward, and share of steps outside the limits, of each law (G, ...); each (G,)."""
     policy, plant = Linear(episodes.plant.r_tilde_bounds), episodes.plant

@@ -17,7 +17,7 @@ from jaxouter.evaluation.baselines import BASELINES, identified
 from jaxouter.evaluation.baselines.clairvoyant import plan
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.jobs import WITHIN, Done, Entrant, Job
-from jaxouter.evaluation.metrics import figures_of_merit
+from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit
 from jaxouter.evaluation.results import GridErrors, Row, StabilityRow
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.stability import analyse
@@ -217,7 +217,22 @@ def test_rows_of_what_diverged():
         assert row.within_limits is False
         assert (row.mae, row.ratio_to_limit, row.ratio_to_bound, row.improvement) == (None,) * 4
     assert not rows["static"].diverged
-    assert (rows["static"].mae, rows["static"].ratio_to_limit, rows["static"].improvement) == (2.0, None, None)
+    assert (rows["static"].mae, rows["static"].ratio_to_limit, rows["static"].improvement) == (2.0, 1.0, None)
+
+
+@pytest.mark.parametrize(
+    ("figures", "limit"),
+    [
+        ({"oracle": (2.0, 0.0), "lq-exact": (1.5, 0.0), "static": (3.0, 0.0)}, 1.5),
+        ({"oracle": (2.0, 0.0), "lq-exact": (1.5, 0.01), "static": (3.0, 0.0)}, 2.0),  # outside the limits
+        ({"oracle": (2.0, 0.05), "lq-exact": (1.5, 0.01), "static": (3.0, 0.02)}, 1.5),  # all are; it is so least
+        ({"oracle": (2.0, None), "none": (1.0, None), "learned": (0.5, None)}, 1.0),  # the inner loop knows as much
+        ({"static": (3.0, 0.0), "learned": (0.5, 0.0)}, None),  # none that is made from the true plant
+    ],
+)
+def test_limit_is_the_least_error_of_the_privileged_within_the_limits(figures, limit):
+    found = {name: FiguresOfMerit(mae=mae, violation_time=outside) for name, (mae, outside) in figures.items()}
+    assert jobs.limit(found) == limit
 
 
 @pytest.mark.parametrize(
@@ -419,14 +434,16 @@ def test_what_concerns_baselines_alone_is_kept_and_the_rest_is_not(run, own):
 
 
 def test_identified_knows_its_baselines():
-    with pytest.raises(ValueError, match="no policy 'clairvoyant'; the policies are: none, static, pi, mpc"):
+    with pytest.raises(
+        ValueError, match="no policy 'clairvoyant'; the policies are: none, static, lq, lq-return, pi, mpc"
+    ):
         identified("clairvoyant", "lag")
     with pytest.raises(ValueError, match="no plant 'boat'"):
         identified("static", "boat")
     assert identified("none", "lag").steps == 0
     assert identified("static", "lag").steps == steady_state.LEVELS * lag.LAG.episode_steps
     for name, baseline in BASELINES.items():
-        assert baseline.kind == ("limit" if name == "oracle" else "baseline")
+        assert baseline.kind == ("limit" if name in ("oracle", "lq-exact", "mpc-exact") else "baseline")
 
 
 def test_processes_do_what_one_does_and_hand_on_what_fails(monkeypatch, tmp_path, own):

@@ -1,7 +1,7 @@
 """The policies that the learned one is compared with: what an engineer would do in its place, and the limits.
 
 Each is identified and tuned on the training distribution, through r~ and y alone, by the same figure that the learner
-maximises, the return; `oracle` and `clairvoyant` know more and say what is possible at all.
+maximises; `oracle`, `lq-exact`, `mpc-exact` and `clairvoyant` know more and say what is possible at all.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import chex
 import jax
 
 from jaxouter.evaluation import cache
-from jaxouter.evaluation.baselines import deepc, inverse, lq, mpc, oracle, pi
+from jaxouter.evaluation.baselines import deepc, exact, inverse, lq, mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import steady_state
@@ -80,11 +80,17 @@ BASELINES: dict[str, Baseline] = {
         "baseline", inverse.tune, inverse.build, "Network that learned r~ from past and future y, without preview."
     ),
     "oracle": Baseline(
-        "limit", oracle.tune, oracle.build, "The learner's actor, trained by back-propagation through the simulator."
+        "limit",
+        oracle.tune,
+        oracle.build,
+        "A correction of lq-exact by the learner's network, trained by back-propagation through the simulator.",
     ),
+    "lq-exact": Baseline("limit", exact.tune_lq, lq.build, "LQ law of the true plant."),
+    "mpc-exact": Baseline("limit", exact.tune_mpc, mpc.build, "MPC of the true plant."),
 }
 NAMES = (*BASELINES, CLAIRVOYANT)
 BUDGET = 128_000  # environment steps that identification and tuning of a baseline may take
+LIMITS = tuple(name for name, known in BASELINES.items() if known.kind == "limit")
 SIMPLE = ("none", "static")  # what costs next to nothing
 
 

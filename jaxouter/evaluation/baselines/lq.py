@@ -14,7 +14,7 @@ import numpy as np
 from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification import dynamics, steady_state
-from jaxouter.identification.lq import Figure, choose, warn_short
+from jaxouter.identification.lq import Choice, Figure, choose, warn_short
 from jaxouter.identification.records import record, within
 from jaxouter.loop.policy import Linear, LinearLaw
 from jaxouter.plants import Plant
@@ -32,11 +32,15 @@ def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: i
     report("choosing its law", 0.5)
     start = learner(plant).pretraining
     found = choose(plant, [data], static, key_choose, history, start.noise, start.load, figure)
+    return kept(found, explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size)
+
+
+def kept(found: Choice, steps: int) -> Tuned:
+    """What was found, as it is kept."""
     law = LinearLaw(*(np.asarray(each, np.float64) for each in found.law))  # type: ignore[arg-type]
     settings = {name: float(getattr(law, name)) for name in ("offset", "r", "y")}
     settings |= {} if found.settings is None else found.settings._asdict()
     settings |= {"mae": found.mae, "static_mae": found.static_mae, "most": found.most}
-    steps = explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size
     return Tuned(settings, {name: np.asarray(getattr(law, name)) for name in ("y_past", "r_tilde_past")}, steps)
 
 

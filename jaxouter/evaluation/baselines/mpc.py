@@ -6,6 +6,7 @@ random walk, is estimated along (offset-free). At each step a quadratic programm
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differen
 from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned
 from jaxouter.identification.linear_models import ARX, HORIZON, choose_arx
-from jaxouter.identification.records import record, within
+from jaxouter.identification.records import Record, record, within
 from jaxouter.plants import Plant
 
 RECORD = 50  # episodes of the record
@@ -174,11 +175,25 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     key_record, key_episodes = jax.random.split(key)
     data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("identifying its model", 0.0)
+    episodes = learners_episodes(plant, params, key_episodes)
+    return tuned(plant, data, lambda found: score(found, (), episodes), budget, episodes.r.size, report)
+
+
+def tuned(plant: Plant, data: Record, score: Callable[[MPC], float], budget: int, each: int, report: Report) -> Tuned:
+    """The model of a record, and the settings with the greatest score.
+
+    Args:
+        plant: as declared.
+        data: exciting episodes.
+        score: of a controller.
+        budget: control steps of the record and of all scores together.
+        each: control steps of a score.
+        report: told how far it is.
+    """
     arx = choose_arx(data, round(HORIZON * plant.episode_steps))
     horizons = horizons_for(plant, arx.dead)
     model = innovations_form(arx)
-    episodes = learners_episodes(plant, params, key_episodes)
-    most = (budget - data.r_tilde.size) // episodes.r.size
+    most = max(1, (budget - data.r_tilde.size) // each)
     grid = {
         "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
         "disturbance": (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1),
@@ -189,11 +204,11 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     start = {"move_weight": 0.1, "disturbance": 1e-3, "noise": 3e-3, "horizon": horizons[2], "margin": 1.0}
 
     def value(settings: dict[str, Any]) -> float:
-        return score(controller(plant, model, arx.sigma, MPCSettings(**settings)), (), episodes)
+        return score(controller(plant, model, arx.sigma, MPCSettings(**settings)))
 
     found, spent = coordinate_search(value, grid, start, most, report)
     settings = found | {"dead": arx.dead, "c": arx.c, "sigma": arx.sigma}
-    return Tuned(settings, {"a": arx.a, "b": arx.b}, data.r_tilde.size + spent * episodes.r.size)
+    return Tuned(settings, {"a": arx.a, "b": arx.b}, data.r_tilde.size + spent * each)
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[MPC, tuple[()]]:

@@ -1,8 +1,9 @@
-"""`oracle`, the limit: the learner's own actor and observation, trained through the simulator on the return itself.
+"""`oracle`: a correction of the true plant's LQ law, trained through the simulator on the MAE itself.
 
-The plants are differentiable, so the gradient of the return is computed by back-propagation through whole episodes of
-the training distribution (analytic policy gradient). What this policy reaches is what the observation and the network
-allow; what the learner lacks to it, it lacks by learning. It reads the plant's equations, which no outer loop can.
+The plants are differentiable, so the gradient of the cost is computed by back-propagation through whole episodes of the
+training distribution (analytic policy gradient). The cost is the error and what y exceeds the plant's limits by, priced
+as in the reward. The network is the learner's, its history as long as that of the law. It reads the plant's equations,
+which no outer loop can. With `lq-exact` and `mpc-exact` it is the limit.
 """
 
 from __future__ import annotations
@@ -18,24 +19,28 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from jaxouter.evaluation.baselines.tuning import Report
+from jaxouter.evaluation.baselines import exact
+from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned, cached
-from jaxouter.identification import counterfactual, dynamics
+from jaxouter.identification import counterfactual
 from jaxouter.identification.steady_state import LEVELS, static
-from jaxouter.loop.policy import LinearLaw, affine
+from jaxouter.loop.policy import LinearLaw, padded
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant, make
-from jaxouter.training.config import TrainConfig, preset, to_dict
+from jaxouter.training.config import TrainConfig, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, folded, pretrain
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
 BATCH = 64  # episodes a gradient step and seed
+BASE = "base"  # of the arrays of the law, among those of the actor
 FIRST_STAGE = 1000  # gradient steps; each stage then doubles their number
 STAGES = 3
 MOST = FIRST_STAGE * 2 ** (STAGES - 1)  # gradient steps
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
+ERROR = RewardConfig(beta_h=0.0, beta_b=0.0)  # the error, and what is outside the limits
 DRAWN = 2048  # plants that are simulated beforehand
 VALIDATION = 512  # training episodes on which the best seed is chosen
 
@@ -44,7 +49,7 @@ VALIDATION = 512  # training episodes on which the best seed is chosen
 def returns(
     rollout: DifferentiableRollout, actors: Any, base: LinearLaw, plant_params: Any, key: chex.PRNGKey
 ) -> jax.Array:
-    """Mean return of each actor (seeds, ...) on `VALIDATION` episodes of the training distribution; (seeds,)."""
+    """Minus the mean cost of each actor (seeds, ...) on `VALIDATION` episodes of training; (seeds,)."""
 
     def mean(actor: Any) -> jax.Array:
         keys = jax.random.split(key, VALIDATION)
@@ -58,7 +63,7 @@ def differentiable(config: TrainConfig) -> tuple[DifferentiableRollout, Any]:
     """The roll-out with actor and disturbances of a configuration, and the parameters of its plant."""
     trainer, env = build_trainer(config)
     plant = replace(trainer.env.plant, reward_terms=())  # the limit is of what is reported
-    return DifferentiableRollout.of(config.pretraining, plant, trainer.policy, BATCH), env.plant
+    return DifferentiableRollout.of(config.pretraining, plant, trainer.policy, BATCH, reward=ERROR), env.plant
 
 
 def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
@@ -85,7 +90,7 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
         def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
             report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
 
-        actor = pretrain(start, plant, of_plant, trainer.policy, learned, keys, heard)
+        actor = pretrain(start, plant, of_plant, trainer.policy, learned, keys, heard, reward=ERROR)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
         return kept(actor, learned.base, {"gradient_steps": start.gradient_steps}, steps)
 
@@ -96,16 +101,23 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
     del budget
-    history, _ = dynamics.suitable_history(plant, params, key)
-    found = train(differentiable(replace(preset(plant.name), history=history))[0], params, key, report)
-    return found._replace(settings=found.settings | {"history": history})
+    key_law, key_train = jax.random.split(key)
+    found, history = exact.law(plant, params, key_law)
+    history = max(history, len(found.law.y_past))
+    rollout = differentiable(_config(plant, history))[0]
+    trained = train(rollout, params, padded(found.law, history), key_train, report)
+    return trained._replace(settings=trained.settings | {"history": history})
 
 
-def train(rollout: DifferentiableRollout, params: Any, key: chex.PRNGKey, report: Report) -> Tuned:
+def _config(plant: Plant, history: int) -> TrainConfig:
+    """The default preset with another history; the base law is made elsewhere."""
+    return replace(learner(plant), history=history, base="static")
+
+
+def train(rollout: DifferentiableRollout, params: Any, base: LinearLaw, key: chex.PRNGKey, report: Report) -> Tuned:
     """Train three seeds in stages that double what there is, until one gains less than 1 %; the best seed."""
     plant = rollout.plant
-    key_static, key_white, key_seeds, key_run, key_test = jax.random.split(key, 5)
-    _, base = static(plant, params, key_static)
+    key_white, key_seeds, key_run, key_test = jax.random.split(key, 4)
     white = rollout.whitening(base, params, key_white)
     actors = jax.vmap(lambda key: rollout.policy.init_actor(jax.random.split(key)[0]))(
         jax.random.split(key_seeds, SEEDS)
@@ -137,17 +149,16 @@ def train(rollout: DifferentiableRollout, params: Any, key: chex.PRNGKey, report
 def kept(actor: Any, base: LinearLaw, settings: dict[str, Any], steps: int) -> Tuned:
     """What was found, as it is kept."""
     arrays = {"/".join(path): np.asarray(leaf) for path, leaf in flatten_dict(actor).items()}
-    return Tuned({"slope": float(base.r), "offset": float(base.offset)} | settings, arrays, steps)
+    arrays |= {f"{BASE}/{name}": np.asarray(leaf) for name, leaf in base._asdict().items()}
+    return Tuned(settings, arrays, steps)
 
 
 def learned(tuned: Tuned) -> LearnedParams:
     """The policy's parameters from what was found."""
-    actor = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf) for name, leaf in tuned.arrays.items()})
-    base = affine(*(tuned.settings[name] for name in ("slope", "offset")))
-    return LearnedParams(actor, base)
+    leaves = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf, float) for name, leaf in tuned.arrays.items()})
+    return LearnedParams(actor=leaves, base=LinearLaw(**leaves.pop(BASE)))
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
     """The policy from what `tune` found."""
-    config = replace(preset(plant.name), history=tuned.settings["history"])
-    return build_trainer(config)[0].policy, learned(tuned)
+    return build_trainer(_config(plant, tuned.settings["history"]))[0].policy, learned(tuned)

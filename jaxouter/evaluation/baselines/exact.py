@@ -1,0 +1,56 @@
+"""`lq-exact` and `mpc-exact`: the LQ law and MPC of the true plant. With `oracle` they are the limit.
+
+Nothing about the plant is hidden when they are made: the model is that of the plant without noise, and they are tuned
+on the plant itself, by the MAE. In operation they see r and y alone, without preview.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import numpy as np
+
+from jaxouter.evaluation.baselines import lq, mpc
+from jaxouter.evaluation.baselines.tuning import Report, learner, learners_episodes
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import rollout
+from jaxouter.identification import dynamics, steady_state
+from jaxouter.identification.lq import Choice, choose
+from jaxouter.identification.records import record, within
+from jaxouter.plants import Plant
+
+RECORD = 256  # episodes
+
+
+def law(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Choice, int]:
+    """The LQ law of the true plant that has the least MAE on it, with a sensor without noise; and the history."""
+    key_explore, key_static, key_record, key_choose = jax.random.split(key, 4)
+    history, _ = dynamics.suitable_history(plant, params, key_explore)
+    _, static = steady_state.static(plant, params, key_static)
+    clean = within(record(plant, plant.noise_free(params), key_record, RECORD), plant.divergence_bounds)
+    load = learner(plant).pretraining.load
+    return choose(plant, [clean], static, key_choose, history, 0.0, load, on=params), history
+
+
+def tune_lq(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """`law`; `budget` is no bound."""
+    del budget, report
+    found, _ = law(plant, params, key)
+    return lq.kept(found, RECORD * plant.episode_steps)
+
+
+def tune_mpc(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+    """As `mpc`, but for the model and the MAE; `budget` bounds the settings that are tried."""
+    key_record, key_episodes = jax.random.split(key)
+    clean = within(record(plant, plant.noise_free(params), key_record, RECORD), plant.divergence_bounds)
+    report("identifying its model", 0.0)
+    episodes = learners_episodes(plant, params, key_episodes)
+
+    def score(controller: mpc.MPC) -> float:
+        error = mae(rollout(controller, (), episodes))
+        return -error if np.isfinite(error) else -np.inf
+
+    return mpc.tuned(plant, clean, score, budget, episodes.r.size, report)
