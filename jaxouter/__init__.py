@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jaxouter.loop.policy import Policy
     from jaxouter.plants import Plant
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 _MODULES = {
     "Agent": "agents",
     "Plant": "plants",

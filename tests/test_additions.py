@@ -77,7 +77,9 @@ def test_the_commands_know_them_by_their_files(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     named = ["--plant", PLANT, "--agent", LEARNER]
     evaluate.main([str(folder), *named, "--json", "found.json"])
-    assert set(json.loads(Path("found.json").read_text())["scenarios"]) == {"Room/day", "Room/frost", "Room/steps"}
+    assert set(json.loads(Path("found.json").read_text())["scenarios"]) == {
+        f"Room/{name}" for name in ("day", "frost", "steps", "rest", "rest-noise")
+    }
     export.main([str(folder / "seed-0"), *named, "--format", "npz", "--out", "controller.npz", "--force"])
     assert ControllerSpec.load(Path("controller.npz")).plant == "Room"
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import matplotlib
 import msgspec
+import numpy as np
 import pytest
 import tyro
 
@@ -130,10 +131,10 @@ def test_sweep_and_stability_are_those_of_the_first_seed(compared):
     stability = compared.content["stability"]
     for name in POLICIES:
         rows = [row for row in stability if row["policy"] == name]
-        assert [row["set_point"] for row in rows] == [-16, -8, 0, 8, 16]
+        assert [row["set_point"] for row in rows] == pytest.approx(np.linspace(-16, 16, 19).tolist())
         assert {row["scenario"] for row in rows} == {"pitch/paper"}
         radii = [row["spectral_radius"] for row in rows]
-        assert radii == [None] * 5 if name == "lead.py:Lead" else max(radii) < 1
+        assert radii == [None] * 19 if name == "lead.py:Lead" else max(radii) < 1
 
 
 def test_csv_has_the_same_rows(compared):
@@ -234,7 +235,10 @@ def place(tmp_path, monkeypatch):
     ("arguments", "text"),
     [
         (["submarine"], "there is no plant 'submarine'; the plants are: pitch, heaters"),
-        (["--policy", "best"], "there is no policy 'best'; it may be FILE.py:CLASS or one of: none, static, pi, mpc"),
+        (
+            ["--policy", "best"],
+            "there is no policy 'best'; it may be FILE.py:CLASS or one of: none, static, lq, lq-return, pi, mpc",
+        ),
         (["--policy", "lead.py"], "there is no policy 'lead.py'; it may be FILE.py:CLASS"),
         (
             ["--policy", "nowhere.py:Lead"],

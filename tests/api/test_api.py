@@ -87,7 +87,7 @@ def test_the_policy_and_its_controller_agree(run):
 
 def test_it_is_evaluated_drawn_and_exported(run, tmp_path):
     found = run.evaluate(progress=False)
-    assert list(found) == [f"Room(tau=4)/{name}" for name in ("day", "frost", "steps")]
+    assert list(found) == [f"Room(tau=4)/{name}" for name in ("day", "frost", "steps", "rest", "rest-noise")]
     assert found["Room(tau=4)/day"].figures.mae == pytest.approx(run.metrics[-1]["mae"])
     slower = run.evaluate("day", set={"tau": 6.0}, progress=False)
     assert list(slower) == ["Room(tau=6.0)/day"]

@@ -403,11 +403,11 @@ def test_sweep_is_the_error_over_the_grid():
 
 def test_stability_goes_over_the_range_of_evaluation(own):
     rows = jobs.analyse(STATIC, "lag", "lag/steps", 2024).settings["rows"]
-    assert [row["set_point"] for row in rows] == [-1.0, -0.5, 0.0, 0.5, 1.0]
-    expected = analyse(*jobs.load(STATIC, "lag"), *lag.make(), [0.5])[0]
-    assert rows[3] == pytest.approx(msgspec.to_builtins(expected))
-    assert rows[3]["spectral_radius"] == pytest.approx(np.exp(-lag.CONTROL_STEP / 0.3), rel=1e-6)
-    assert rows[3]["y"] == pytest.approx(0.5, abs=1e-3)
+    assert [row["set_point"] for row in rows] == pytest.approx(np.linspace(-1.0, 1.0, 19).tolist())
+    expected = analyse(*jobs.load(STATIC, "lag"), *lag.make(), [1.0])[0]
+    assert rows[-1] == pytest.approx(msgspec.to_builtins(expected))
+    assert rows[-1]["spectral_radius"] == pytest.approx(np.exp(-lag.CONTROL_STEP / 0.3), rel=1e-6)
+    assert rows[-1]["y"] == pytest.approx(1.0, abs=1e-3)
     notes = {row["note"] for row in jobs.analyse(own("Host"), "lag", "lag/steps", 2024).settings["rows"]}
     assert notes == {"policy is not a JAX function"}
 

@@ -59,7 +59,7 @@ def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(steady_state, "dc_gain", line)
     actor, params = steady_state.static(*make("heaters"), KEY)
     r = jnp.asarray(10.0, float)
-    assert float(actor.act(params, (), r, r)[1]) == pytest.approx(26.0)
+    assert float(actor.act(params, actor.init(params, r, r), r, r)[1]) == pytest.approx(26.0)
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_r_passes_then_the_static_inverse_acts_then_what_was_learned_on_it(learn
     recorded = [row for row in rows if row.why == "recording"]
     assert len(recorded) == 201  # 200 steps, each up to the next sample
     assert [row.r_tilde for row in recorded] == [row.r for row in recorded]
-    slope, offset = loop.state.base
+    offset, slope, *_ = loop.state.base
     assert float(slope) == pytest.approx(1 / 0.7, rel=1e-3)
     assert float(offset) == pytest.approx(-1 / 0.7, rel=1e-2)
     assert loop.updates == int(loop.state.agent.updates) == sum(row.why != "recording" for row in rows) + 1
@@ -120,12 +120,14 @@ def test_the_replay_holds_what_happened(learned):
     np.testing.assert_allclose(kept["y_next"], [row.y for row in rows[1:]], rtol=1e-5)
     np.testing.assert_allclose(kept["r_next"], [row.r for row in rows[1:]], rtol=1e-5)
     np.testing.assert_array_equal(kept["age"], np.arange(699))
-    slope, offset = (float(value) for value in loop.state.base)
+    offset, slope = (float(value) for value in loop.state.base[:2])
     np.testing.assert_allclose(
         offset + slope * kept["r"] + 5.0 * kept["action"], kept["r_tilde"], atol=1e-4
     )  # also of what was recorded
     moves = np.abs(np.diff(kept["r_tilde"])), np.abs(kept["y_next"] - kept["y"])[1:]
-    price = 0.3 * np.abs(kept["r"] - kept["y_next"])[1:] + 0.1 * moves[0] + 0.1 * moves[1]
+    e, width = np.abs(kept["r"] - kept["y_next"])[1:], 0.003 * np.ptp(loop.live.env.plant.setpoint_range)
+    small = np.minimum(e, width)  # rounded at zero
+    price = 0.3 * small * (e - small / 2) / width + 0.1 * moves[0] + 0.1 * moves[1]
     np.testing.assert_allclose(kept["reward"][1:], -price / 2, atol=1e-5)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.training.config import PretrainingConfig, TrainConfig, preset
 
 TINY = [
@@ -28,4 +29,5 @@ def small(plant: str = "heaters", name: str = "default", **changes) -> TrainConf
     of_agent = dict(hidden=(16, 16), batch_size=32, n_step=1, prefill=640, updates=1, replay=1_600)
     of_agent |= {f.name: changes.pop(f.name) for f in fields(base.agent) if f.name in changes}
     own = dict(steps=3_040, epoch=960, environments=8, history=3, base="absolute", pretraining=PretrainingConfig())
+    own |= dict(correction=1.0, reward=RewardConfig())
     return with_agent(replace(base, **{**own, **changes}), **of_agent)

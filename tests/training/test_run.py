@@ -245,9 +245,9 @@ def test_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a run folder"):
         RunFolder.open(tmp_path)
     for content, text in (
-        ({"format": 99}, "of format 99, and this version reads format 3: another version of jaxouter made it"),
-        ({"format": 2, "versions": {"jaxouter": "0.1.0"}}, r"of format 2, .*: jaxouter 0\.1\.0 made it, and reads it"),
-        ({"format": 3, "config": {"plant": "pitch"}}, "is not a configuration"),
+        ({"format": 99}, "of format 99, and this version reads format 4: another version of jaxouter made it"),
+        ({"format": 3, "versions": {"jaxouter": "0.2.0"}}, r"of format 3, .*: jaxouter 0\.2\.0 made it, and reads it"),
+        ({"format": 4, "config": {"plant": "pitch"}}, "is not a configuration"),
     ):
         (tmp_path / "config.json").write_text(json.dumps(content))
         with pytest.raises(ValueError, match=text):

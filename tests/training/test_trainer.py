@@ -44,7 +44,9 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
 
     @jax.jit
     def without_reset(state, action, keys):
-        r_tilde = jax.vmap(trainer.policy.r_tilde, (None, 0, 0))(state.base, state.env.r, action)
+        env = state.env
+        of_each = jax.vmap(trainer.policy.r_tilde, (None, 0, 0, 0, 0))
+        r_tilde = of_each(state.base, env.memory, env.r, env.y_seen, action)
         return jax.vmap(trainer.env.step_env, (0, 0, 0, None))(keys, state.env, r_tilde, params)
 
     seen = []  # (obs, action, reward, terminated, truncated, final observation) of each step
