@@ -90,7 +90,7 @@ def metadata(spec: ControllerSpec) -> dict[str, str]:
     """What a caller needs to know, as strings for the model's metadata."""
     (low, high), (r_min, r_max), (y_min, y_max) = spec.r_tilde_bounds, spec.setpoint_range, spec.y_range
     numbers = {"control_step": spec.control_step, "r_tilde_min": low, "r_tilde_max": high}
-    numbers |= {"r_min": r_min, "r_max": r_max, "y_min": y_min, "y_max": y_max, "history": spec.history}
+    numbers |= {"r_min": r_min, "r_max": r_max, "y_min": y_min, "y_max": y_max, "past": spec.remembered}
     texts = {"plant": spec.plant, "y_unit": spec.y_unit, "time_unit": spec.time_unit, "start": START}
     return texts | {name: repr(value) for name, value in numbers.items()}
 

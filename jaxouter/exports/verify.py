@@ -21,8 +21,9 @@ from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 STEPS = 1_000
 AT_A_STEP = 1e-5  # tolerance as share of the range of r~, if both start each step in the policy's state
-IN_CLOSED_LOOP = 1e-4  # likewise, if each carries its own state
+IN_CLOSED_LOOP = 1e-4  # likewise, if each carries its own state for a while
 HELD = 20  # control steps for which a set-point is held
+ALONE = 50  # control steps for which a controller carries its own state; y does not answer, so deviations may grow
 
 
 class Controller(Protocol):
@@ -93,10 +94,12 @@ def _record(policy: LearnedPolicy, params: LearnedParams, r: jax.Array, y: jax.A
 
 
 def deviation(controller: Controller, spec: ControllerSpec, seen: Signals) -> Deviation:
-    """Deviation of a controller from the policy: in the policy's state at each step, and with its own state."""
+    """Deviation of a controller from the policy: in the policy's state at each step, and with its own for 50 steps."""
     state, got = controller.init(seen.y[0]), []
     for k, (r, y) in enumerate(zip(seen.r, seen.y, strict=True)):
-        _, at_a_step = controller.act(jax.tree.map(lambda leaf, k=k: leaf[k], seen.state), r, y)
+        of_policy = jax.tree.map(lambda leaf, k=k: leaf[k], seen.state)
+        _, at_a_step = controller.act(of_policy, r, y)
+        state = of_policy if k and k % ALONE == 0 else state
         state, in_closed_loop = controller.act(state, r, y)
         got.append((float(at_a_step), float(in_closed_loop)))
     low, high = spec.r_tilde_bounds

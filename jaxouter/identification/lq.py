@@ -208,7 +208,8 @@ def choose(
         history: past samples that show the state of the plant and its dead time.
         noise, load: of these episodes, see `TrainingEpisodes`.
         figure: what is best.
-        on: parameters of the plant, to compare the laws on the plant itself; None: on the record's own model.
+        on: parameters of the plant, to compare the laws on the plant itself, whatever they do with measurement noise;
+            None: on the record's own model.
     """
     whole = Record(*map(np.concatenate, zip(*data, strict=True)))
     steps, wanted = whole.r_tilde.shape[1], lags_for(plant, history)
@@ -218,7 +219,7 @@ def choose(
     if not models:
         return Choice(static, None, np.inf, np.inf, most)
     held_out = [jax.tree.map(lambda leaf: leaf[3 * len(leaf) // 4 :], model) for model in models]
-    settings, laws = zip(*_candidates(plant, whole, tried), strict=True)
+    settings, laws = zip(*_candidates(plant, whole, tried, NOISES if on is None else (0.0, *NOISES)), strict=True)
     together = jax.tree.map(lambda *each: jnp.stack(each), *(padded(each, max(tried)) for each in (static, *laws)))
     if on is None:
         episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), noise, load)
@@ -228,8 +229,9 @@ def choose(
     mae, reward, outside = (np.asarray(each, np.float64) for each in _compared(episodes, together, replayed, key))
     responses = [[np.asarray(each[0], np.float64) for each in (model.a, model.b)] for model in models[:PLANTS]]
     numbers = jax.tree.map(lambda each: np.asarray(each, np.float64), together)
-    noisier = np.max([amplification(numbers, a, b, 2 * steps) for a, b in responses], axis=0)
-    counts = np.isfinite(mae) & (outside <= outside[0] + WITHIN) & (noisier <= NOISIER)
+    counts = np.isfinite(mae) & (outside <= outside[0] + WITHIN)
+    if on is None:
+        counts &= np.max([amplification(numbers, a, b, 2 * steps) for a, b in responses], axis=0) <= NOISIER
     order = np.argsort(np.where(counts, mae if figure == "mae" else -reward, np.inf)[1:], kind="stable")
     for i in order[: np.count_nonzero(counts[1:])]:
         if all(radius(laws[i], a, b) <= 1.0 - REST / plant.episode_steps for a, b in responses):
@@ -249,12 +251,14 @@ def warn_short(plant: Plant, most: int | None) -> None:
         warnings.warn(text, IdentificationWarning, stacklevel=3)
 
 
-def _candidates(plant: Plant, data: Record, lags: Sequence[int]) -> Iterator[tuple[Settings, LinearLaw]]:
+def _candidates(
+    plant: Plant, data: Record, lags: Sequence[int], noises: Sequence[float]
+) -> Iterator[tuple[Settings, LinearLaw]]:
     """The laws that are compared."""
     of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
     for n in lags:
-        models = fits(data, n, [noise * of_y for noise in NOISES])
-        for noise, (a, b) in zip(NOISES, models, strict=True):
+        models = fits(data, n, [noise * of_y for noise in noises])
+        for noise, (a, b) in zip(noises, models, strict=True):
             for price in PRICES:
                 yield Settings(n, noise, price), law(a, b, price * (of_y / of_r_tilde) ** 2)
 

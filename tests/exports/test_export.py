@@ -27,6 +27,7 @@ from fmpy.validation import validate_fmu
 from jaxouter import export, plants
 from jaxouter.exports import c, files, fmu, verify
 from jaxouter.exports.spec import ControllerSpec
+from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import registry
 from jaxouter.training.run import RunFolder
 from tests.load import ROOT
@@ -105,6 +106,23 @@ def test_what_was_written_does_what_the_policy_does(runs, plant, kind, tmp_path,
     assert text in out
     written = {path.name} | ({"controller.h"} if kind == "c" else set())
     assert {each.name for each in tmp_path.iterdir()} == written
+
+
+@pytest.mark.parametrize("lags", [2, 7])  # fewer and more than the observation holds
+@pytest.mark.parametrize("kind", files.FORMATS)
+def test_a_base_law_with_lags_is_written_too(pitch, kind, lags, tmp_path):
+    """A law that integrates, as the LQ law does."""
+    numbers = 0.1 * np.random.default_rng(0).normal(size=(2, lags))
+    numbers[1] -= numbers[1].mean()
+    numbers[1, 0] += 1.0  # r~ stays where nothing moves
+    law = LinearLaw(*(jnp.asarray(each, float) for each in (0.0, 0.5, -0.5, *numbers)))
+    policy = dataclasses.replace(pitch.policy, observer=dataclasses.replace(pitch.policy.observer, lags=lags))
+    params = pitch.params._replace(base=law)
+    spec = ControllerSpec.of(policy, params, pitch.run.trainer[0].env.plant)
+    assert (spec.lags, spec.remembered) == (lags, max(3, lags))
+    path = tmp_path / f"controller.{kind}"
+    files._write(kind, path, spec, policy, params)
+    assert verify.verify(kind, path, spec, policy, params).small
 
 
 def test_a_controller_of_other_numbers_is_noticed(pitch, tmp_path):
@@ -282,7 +300,7 @@ def test_onnx_says_how_to_call_it(pitch, tmp_path):
     said = {each.key: each.value for each in model.metadata_props}
     assert (said["plant"], said["y_unit"], said["time_unit"]) == ("pitch", "crad", "s")
     numbers = {
-        key: float(said[key]) for key in ("control_step", "r_tilde_min", "r_tilde_max", "r_min", "r_max", "history")
+        key: float(said[key]) for key in ("control_step", "r_tilde_min", "r_tilde_max", "r_min", "r_max", "past")
     }
     assert list(numbers.values()) == [0.1, -60.0, 60.0, -17.0, 17.0, 3.0]
     assert "integral is 0" in said["start"]
@@ -292,7 +310,7 @@ def test_onnx_says_how_to_call_it(pitch, tmp_path):
     assert [each.name for each in session.get_inputs()] == ["r", "y", "y_past", "r_tilde_past", "integral"]
     names = [each.name for each in session.get_outputs()]
     assert names == ["r_tilde", "y_past_next", "r_tilde_past_next", "integral_next"]
-    y, h = np.float32(80.0), int(said["history"])
+    y, h = np.float32(80.0), int(said["past"])
     before = np.clip(y, np.float32(said["r_tilde_min"]), np.float32(said["r_tilde_max"]))
     state = {"y_past": np.full(h, y), "r_tilde_past": np.full(h, before), "integral": np.zeros((), np.float32)}
     wanted = pitch.spec.init(80.0)

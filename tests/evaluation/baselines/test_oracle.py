@@ -1,5 +1,7 @@
 """The oracle on the lag, in small."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,10 @@ import pytest
 from jaxouter import plants
 from jaxouter.evaluation.baselines import mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
+from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.rollout import rollout as rollout_of
 from jaxouter.identification import linear_models, records, steady_state
+from jaxouter.loop.policy import Linear
 from jaxouter.training.config import PretrainingConfig, preset
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import Whitening, folded
@@ -50,18 +55,24 @@ def white(rollout, base):
     return rollout.whitening(base, lag.make()[1], KEY)
 
 
+def error(policy, params, episodes) -> float:
+    return mae(rollout_of(policy, params, episodes))
+
+
 @pytest.mark.slow
-def test_it_is_as_good_as_pi_and_mpc(tuned):
-    """Within 3 % in return, on training episodes that none of them has seen."""
+def test_it_follows_better_than_the_exact_law_that_it_corrects_and_than_pi_and_mpc(tuned):
+    """On training episodes that none of them has seen."""
     plant, params = lag.make()
     episodes = training_episodes(plant, params, jax.random.key(1))
-    reached = score(*oracle.build(plant, tuned), episodes)
+    policy, learned = oracle.build(plant, tuned)
+    reached = error(policy, learned, episodes)
+    assert reached < error(Linear(plant.r_tilde_bounds), learned.base, episodes)
     pi_tuned = pi.tune(plant, params, KEY, 20_000, lambda text, share: None)
-    assert reached > 1.03 * score(*pi.build(plant, pi_tuned), episodes)
+    assert reached < error(*pi.build(plant, pi_tuned), episodes)
     exact = mpc.innovations_form(linear_models.fit_arx(records.record(plant, params, KEY, 4), 2, 2))
     for move_weight in (1e-4, 1e-3, 1e-2):
         controller = mpc.controller(plant, exact, 0.0, mpc.MPCSettings(10, move_weight, 1e-3, 0.0, 1e-3))
-        assert reached > 1.03 * score(controller, (), episodes)
+        assert reached < 1.02 * error(controller, (), episodes)
 
 
 @pytest.mark.slow
@@ -69,15 +80,15 @@ def test_steps_and_stages_are_counted(tuned):
     assert tuned.settings["gradient_steps"] == 200
     assert tuned.steps == (200 * 16 + steady_state.LEVELS) * 50
     first, second = (max(values) for values in tuned.settings["returns"])
-    assert second > 1.1 * first  # returns are negative
+    assert second > first
 
 
 @pytest.mark.slow
-def test_built_policy_is_the_one_that_was_chosen(tuned, rollout):
-    """Its return on the validation episodes is the one written down."""
+def test_built_policy_is_the_one_that_was_chosen(tuned):
+    """Its cost on the validation episodes is the one written down."""
     policy, params = oracle.build(lag.LAG, tuned)
-    assert policy == rollout.policy
-    key = jax.random.split(KEY, 5)[4]
+    rollout = replace(oracle.differentiable(preset("lag"))[0], policy=policy)
+    key = jax.random.split(jax.random.split(KEY)[1], 4)[3]
     one = jax.tree.map(lambda leaf: leaf[None], params.actor)
     value = oracle.returns(rollout, one, params.base, lag.make()[1], key)
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
