@@ -27,7 +27,7 @@ from jaxouter.runtime.realtime import Loop, Row, StepError, Timing, run
 from jaxouter.terminal import Interrupt, optional
 from jaxouter.training.run import add_agent, add_plant, write_json
 
-KEPT = {"static": "static inverse", "trained": "as trained"}
+KEPT = {"static": "static inverse", "lq": "LQ law", "trained": "as trained"}
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def report(folder: LiveFolder, loop: Loop) -> None:
     unit = loop.live.env.plant.y_unit
     cli.table(
         "MAE: measured, and predicted for other policies on the same steps",
-        ["", "measured", "r~ = r", KEPT[loop.live.kept], "learned"],
+        ["", "measured", "r~ = r", KEPT[loop.fallback], "learned"],
         [[part, *(number(values[name]) for name in SIGNALS)] for part, values in found["mae"].items()],
     )
     passed = ", ".join(f"{number:,} {why}" for why, number in found["counts"].items() if number)

@@ -63,7 +63,7 @@ def lags_for(plant: Plant, history: int) -> list[int]:
     return sorted({min(n, most) for n in (*LAGS, history) if n >= min(history, LAGS[0])})
 
 
-def fits(data: Record, n: int, noises: Sequence[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+def fits(data: Record, n: int, noises: Sequence[float], levels: bool = True) -> list[tuple[np.ndarray, np.ndarray]]:
     """ARX models y_(k+1) = sum_i a_i y_(k-i) + b_i r~_(k-i) + level of the episode, i from 0 to n - 1.
 
     Measurement noise that is independent from step to step adds its variance to the squares of each lag of y, and
@@ -73,6 +73,7 @@ def fits(data: Record, n: int, noises: Sequence[float]) -> list[tuple[np.ndarray
         data: exciting episodes; samples that are not finite are left out.
         n: lags.
         noises: standard deviations of the noise, in the unit of y.
+        levels: whether each episode has a level of its own, or all have the same.
 
     Returns:
         a and b, (n,) each, for each of the noises.
@@ -84,7 +85,8 @@ def fits(data: Record, n: int, noises: Sequence[float]) -> list[tuple[np.ndarray
     )  # (E, T - n + 1, 2 n + 1)
     known = np.isfinite(rows).all(-1, keepdims=True)
     rows = np.where(known, rows, 0.0)
-    rows -= rows.sum(1, keepdims=True) / np.maximum(known.sum(1, keepdims=True), 1)
+    axes = 1 if levels else (0, 1)
+    rows -= rows.sum(axes, keepdims=True) / np.maximum(known.sum(axes, keepdims=True), 1)
     rows = np.where(known, rows, 0.0).reshape(-1, 2 * n + 1)
     gram, count = rows.T @ rows, int(known.sum())
     found = []
@@ -180,6 +182,12 @@ def radius(found: LinearLaw, a: np.ndarray, b: np.ndarray) -> float:
     loop[1 : n + 1, :n], loop[n + 1] = np.eye(n), chosen
     loop[n + 2 :, n + 1 : 2 * n] = np.eye(n - 1)
     return float(np.abs(np.linalg.eigvals(loop)).max())
+
+
+def comes_to_rest(found: LinearLaw, a: np.ndarray, b: np.ndarray, steps: int) -> bool:
+    """Whether a deviation at a held set-point dies out, and measurement noise moves y little; see `choose`."""
+    alone = LinearLaw(*(np.asarray(each, np.float64)[None] for each in found))  # type: ignore[arg-type]
+    return radius(found, a, b) <= 1.0 - REST / steps and amplification(alone, a, b, 2 * steps)[0] <= NOISIER
 
 
 def choose(

@@ -25,7 +25,7 @@ from jaxouter.training import checkpoint
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import lock, open_run, write_json
 
-FORMAT = 1
+FORMAT = 2
 EPISODES = 64  # random references of a family, which then repeat
 PARTS = {"first quarter": slice(0, 1), "last quarter": slice(3, 4)}  # quarters of the rows
 SIGNALS = ("y", "y_passed", "y_kept", "y_learned")

@@ -1,8 +1,8 @@
 """Policy and learner of a real-time loop: pure, jitted functions of one state.
 
 Without a trained policy, r passes through while a record is made. Then the static inverse identified from the record
-acts, and later the policy learned on top of it. A trained policy acts unchanged at first, and later what it has learned
-since. `jaxouter.runtime.realtime` is the loop in time.
+acts, then the LQ law of a longer record, and later the policy learned on top of that. A trained policy acts unchanged
+at first, and later what it has learned since. `jaxouter.runtime.realtime` is the loop in time.
 
 Once the response of y to a change of r~ is known, each step is replayed under other r~
 (`jaxouter.identification.counterfactual`), at no cost to the plant. Three of these replays predict what passing r
@@ -11,6 +11,7 @@ through, the fallback and the learned policy would have achieved; the rest explo
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, cast
@@ -23,7 +24,7 @@ import numpy as np
 from jaxouter.agents import AgentConfig, OffPolicy, noise
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.replay import Replay, ReplayState
-from jaxouter.identification import linear_models
+from jaxouter.identification import linear_models, lq
 from jaxouter.identification.records import Record
 from jaxouter.loop import rewards
 from jaxouter.loop.environment import Environment
@@ -41,13 +42,17 @@ from jaxouter.training.environments import TrainState
 from jaxouter.training.off_policy import FIELDS, batch
 from jaxouter.training.policy import LearnedPolicy
 
-Kept = Literal["static", "trained"]
+Kept = Literal["static", "lq", "trained"]
 Stage = Literal["recording", "learned"] | Kept
 Why = Stage | Reason
-WHYS: tuple[Why, ...] = ("recording", "static", "trained", "learned", "late", "missing", "not finite", "out of range")
+WHYS: tuple[Why, ...] = (
+    "recording", "static", "lq", "trained", "learned", "late", "missing", "not finite", "out of range"
+)  # fmt: skip
 NAME = "live"
 FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y = r~ at once
 HISTORY = 8  # past samples in the observation of an unknown plant
+LAGS = 15  # past samples in its LQ law
+NOISE, PRICES = 0.02, (0.1, 0.3, 1.0, 3.0, 10.0)  # of the LQ law, see `identification.lq`; the first that comes to rest
 COMPARED = 3  # counterfactuals that are compared: r passed through, the fallback, the learned policy (no exploration)
 EXPLORING = 12  # counterfactuals that explore
 SIGMA, THETA = (0.0125, 0.1), 0.15  # Ornstein-Uhlenbeck noise; sigma of the loop itself and of the last counterfactual
@@ -115,7 +120,7 @@ class Live:
     takeover: int
     """Updates before the learned policy may act."""
     kept: Kept
-    """The fallback, which acts before that."""
+    """The fallback, which acts before that; static until there is an LQ law."""
     reward: RewardConfig = rewards.PAPER
     """Weights of the reward."""
 
@@ -178,9 +183,13 @@ class Live:
         )  # a copy: the agent is donated, and no buffer may be twice
         return fresh._replace(agent=agent, kept=kept, base=state.base, begun=jnp.ones((), bool))
 
+    def fallback(self, state: LiveState) -> Kept:
+        """What acts while the learned policy does not."""
+        return "lq" if self.kept == "static" and np.any(np.asarray(state.base.y_past)) else self.kept
+
     def stage(self, state: LiveState) -> Stage:
         """What decides r~ if nothing is wrong."""
-        return "learned" if state.leads else self.kept if state.begun else "recording"
+        return "learned" if state.leads else self.fallback(state) if state.begun else "recording"
 
     @partial(jax.jit, static_argnums=0)
     def first(self, r: jax.Array, y: jax.Array) -> Sample:
@@ -281,11 +290,20 @@ class Live:
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def relabelled(self, replay: ReplayState, base: LinearLaw) -> ReplayState:
-        """The replay with its actions recomputed for a base law without memory."""
-        rows, places = replay.rows, [FIELDS.index(name) for name in ("r", "r_tilde", "action")]
-        r, r_tilde = (rows[..., place].astype(base.r.dtype) for place in places[:2])
-        action = (r_tilde - base.offset - base.r * r) / self.policy.scale
-        return replay._replace(rows=rows.at[..., places[2]].set(action.astype(rows.dtype)))
+        """The replay with its actions recomputed for another base law."""
+        mirror, dtype = self.replay.mirror, base.r.dtype
+        rings = replay.rows[:, mirror:]
+        r, y, r_tilde, age = (rings[..., FIELDS.index(name)].astype(dtype) for name in ("r", "y", "r_tilde", "age"))
+        starts = (jnp.arange(rings.shape[1])[None] - age.astype(jnp.int32)) % rings.shape[1]
+        y0 = jnp.take_along_axis(y, starts, 1)
+        before = jnp.clip(y0, *self.observer.r_tilde_bounds)
+        law = base.offset + base.r * r + base.y * y
+        for i in range(1, self.observer.lags + 1):
+            past, applied = (jnp.where(age >= i, jnp.roll(x, i, 1), x0) for x, x0 in ((y, y0), (r_tilde, before)))
+            law = law + base.y_past[i - 1] * (past - y) + base.r_tilde_past[i - 1] * applied
+        action = ((r_tilde - law) / self.policy.scale).astype(rings.dtype)
+        rings = rings.at[..., FIELDS.index("action")].set(action)
+        return replay._replace(rows=jnp.concatenate([rings[:, rings.shape[1] - mirror :], rings], 1))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update(self, agent: Any, replay: ReplayState, key: chex.PRNGKey, number: jax.Array) -> Any:
@@ -320,12 +338,33 @@ class Live:
         *law, a, b = (jax.device_put(np.asarray(x, dtype)) for x in found)  # this way nothing is compiled
         return LinearLaw(*law), Response(a, b)
 
-    def _record(self, replay: ReplayState) -> Record:
-        """Windows of H uninterrupted steps of the loop, each with the y after it."""
+    def laws(self, replay: ReplayState, response: Response) -> Iterator[LinearLaw | None]:
+        """The LQ law of recent steps, in pieces of work that fit into a period: None after each but the last.
+
+        Raises:
+            ValueError: no law comes to rest.
+        """
+        plant, n = self.env.plant, self.observer.lags
+        of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
+        windows = self._record(replay, n)
+        (model,) = lq.fits(Record(windows.r_tilde, windows.y), n, [NOISE * of_y], levels=False)
+        yield None
+        a, b = (np.asarray(each, np.float64) for each in response)
+        for price in PRICES:
+            found = lq.law(*model, price * (of_y / of_r_tilde) ** 2)
+            if lq.comes_to_rest(found, a, b, plant.episode_steps):
+                dtype = jnp.result_type(float)
+                yield LinearLaw(*(jax.device_put(np.asarray(x, dtype)) for x in found))
+                return
+            yield None
+        raise ValueError("no linear law made from the record comes to rest")
+
+    def _record(self, replay: ReplayState, n: int | None = None) -> Record:
+        """Windows of n (None: H) uninterrupted steps of the loop, each with the y after it."""
         layout, written = self.replay, int(replay.written)
         recent = np.arange(max(0, written - min(RECENT, layout.steps - layout.mirror)), written)
         rows = np.asarray(replay.rows)[0, recent % layout.steps + layout.mirror].astype(np.float64)
-        field, n = dict(zip(FIELDS, rows.T, strict=True)), self.observer.history
+        field, n = dict(zip(FIELDS, rows.T, strict=True)), n or self.observer.history
         ends = np.flatnonzero(field["age"][n - 1 :] >= n - 1) + n - 1
         windows = ends[:, None] + np.arange(1 - n, 1)
         return Record(field["r_tilde"][windows], np.column_stack([field["y"][windows], field["y_next"][ends]]))
@@ -349,5 +388,5 @@ def declared(dt: float, episode_steps: int, options: PlantOptions) -> tuple[Trai
     fields = options.declared(control_step=dt, episode_steps=episode_steps, y_unit="1")
     fields |= dict(name=NAME, time_unit="s", history=HISTORY, move_threshold=0.0)  # every move of r~ is charged
     plant, _ = arx.make(FOLLOWS, [FOLLOWS], **fields)
-    observer = Observer.of(plant)
+    observer = Observer.of(plant, lags=LAGS)
     return configured(NAME, "live", LIVE), Environment(plant, observer, SetPoint(*plant.setpoint_range))

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxouter.loop.policy import LinearLaw
 from jaxouter.runtime.controller import Transfer, Watch
-from jaxouter.runtime.online import WHYS, Live, LiveState, Sample, Stage, Why
+from jaxouter.runtime.online import WHYS, Kept, Live, LiveState, Sample, Stage, Why
 
 RESERVE = 0.1  # share of a period kept free of updates
 FORGET = 0.9  # decay per update of the longest update time seen
@@ -39,7 +40,7 @@ class Timing:
     """Period, s."""
     learn: bool = False
     record: int = 500
-    """Control steps before the response and the static inverse are identified."""
+    """Control steps before the response and the static inverse are identified; the LQ law is after twice as many."""
     most_updates: int = 8
     """Most updates per period."""
     transfer_steps: int = 10
@@ -109,7 +110,9 @@ class Loop:
         self._met = self._unbroken = False  # whether there was a y yet; whether the previous step was without fault
         self._written = int(state.replay.written)
         self._updates = int(state.updates)
-        self._identify_at = settings.record
+        self._identify_at, self._law_at = settings.record, 2 * settings.record
+        self._laws: Iterator[LinearLaw | None] | None = None  # the LQ law in the making
+        self._unlearned = jax.device_get(live.fresh(state.key).agent)
         self._takeover_at = live.takeover
         self._known = bool(np.any(state.response.b))
         self._errors = np.zeros(4)  # recent mean errors of the loop and of the compared policies
@@ -143,6 +146,11 @@ class Loop:
         return self._stage
 
     @property
+    def fallback(self) -> Kept:
+        """What acts while the learned policy does not."""
+        return self.live.fallback(self._state)
+
+    @property
     def state(self) -> LiveState:
         """The current state."""
         counts, updates = (jnp.asarray(x, jnp.int32) for x in (list(self._counts.values()), self._updates))
@@ -174,7 +182,7 @@ class Loop:
         actors = self._state.kept, self.live.agent.actor(self._state.agent)
         memory, offered = self.live.act(actors, self._state.base, before, self._state.noise, r_seen, y_seen)
         kept, learned = np.asarray(offered).tolist()
-        wanted = {"recording": r, self.live.kept: kept, "learned": learned}
+        wanted = {"recording": r, self.fallback: kept, "learned": learned}
         self._period += 1
         if self.left < 0.0 or (skipped and self._unbroken):
             fault = "late"
@@ -193,6 +201,8 @@ class Loop:
             return
         if not self._known and self._written >= self._identify_at:
             self._identify()
+        elif self._known and self.fallback == "static" and self._written >= self._law_at:
+            self._find_law()
         enough = self._written >= self.live.data.batch_size and self._stage != "recording"
         for _ in range(self.settings.most_updates if enough else 0):
             begun = self._clock()
@@ -205,7 +215,7 @@ class Loop:
             self._updates += 1
             self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
         better = self._errors[LEARNED] < BETTER * self._errors[KEPT]
-        if self._stage == self.live.kept and self._updates >= self._takeover_at and better:
+        if self._stage == self.fallback and self._updates >= self._takeover_at and better:
             self._errors[CAME] = self._errors[KEPT]
             self._enter("learned")
 
@@ -270,7 +280,7 @@ class Loop:
         if self._stage == "learned" and self._errors[CAME] > bound:
             self.sent_back += 1
             self._takeover_at = self._updates + self.live.takeover
-            self._enter(self.live.kept)
+            self._enter(self.fallback)
 
     def _identify(self) -> None:
         """Identify the response, and the static inverse if r has passed through so far."""
@@ -285,7 +295,21 @@ class Loop:
         if self._stage == "recording":
             replay = self.live.relabelled(self._state.replay, base)
             self._state = self._state._replace(replay=replay, base=base, begun=jax.device_put(np.True_))
-            self._enter(self.live.kept)
+            self._enter(self.fallback)
+
+    def _find_law(self) -> None:
+        """Go on making the LQ law; once there is one it acts, and learning begins anew on top of it."""
+        try:
+            self._laws = self._laws or self.live.laws(self._state.replay, self._state.response)
+            law = next(self._laws)
+        except ValueError as error:
+            self.trouble, self._laws, self._law_at = str(error), None, self._written + self.settings.record
+            return
+        if law is not None:
+            replay, agent = self.live.relabelled(self._state.replay, law), jax.device_put(self._unlearned)
+            self._state = self._state._replace(replay=replay, base=law, agent=agent)
+            self._takeover_at, self.trouble = self._updates + self.live.takeover, None
+            self._enter(self.fallback)
 
     def _compile(self) -> None:
         """Compile on copies, as the learner's buffers are donated."""
@@ -298,7 +322,9 @@ class Loop:
         rows = live.relive(rest, actor, sample, np.uint32(0))[2]
         live.gathered(sample)
         if self.settings.learn:
-            live.relabelled(live.write(jax.tree.map(jnp.copy, state.replay), rows), state.base)
+            replay = live.write(jax.tree.map(jnp.copy, state.replay), rows)
+            if live.kept == "static":
+                live.relabelled(replay, state.base)
 
     def _update_takes(self) -> float:
         """The fastest of some updates, s."""

@@ -82,20 +82,22 @@ def learned():
     return ran(tiny(), 700, learn=True, record=200, most_updates=1)
 
 
-def test_r_passes_then_the_static_inverse_acts_then_what_was_learned_on_it(learned):
+def test_r_passes_then_the_static_inverse_acts_then_the_lq_law_then_what_was_learned_on_it(learned):
     loop, rows = learned
     stages = list(dict.fromkeys(row.why for row in rows))
-    assert stages[:2] == ["recording", "static"]
+    assert stages[:3] == ["recording", "static", "lq"]
+    assert [row.why for row in rows].index("lq") in range(401, 410)  # a piece of work a period, after 400 steps
     recorded = [row for row in rows if row.why == "recording"]
     assert len(recorded) == 201  # 200 steps, each up to the next sample
     assert [row.r_tilde for row in recorded] == [row.r for row in recorded]
-    offset, slope, *_ = loop.state.base
-    assert float(slope) == pytest.approx(1 / 0.7, rel=1e-3)
-    assert float(offset) == pytest.approx(-1 / 0.7, rel=1e-2)
-    assert loop.updates == int(loop.state.agent.updates) == sum(row.why != "recording" for row in rows) + 1
+    assert loop.updates == sum(row.why != "recording" for row in rows) + 1
+    assert int(loop.state.agent.updates) == loop.updates - sum(row.why == "static" for row in rows)  # begins anew
+    law = loop.state.base
+    assert float(law.r) == -float(law.y) > 0.0
+    assert float(jnp.sum(law.r_tilde_past)) == pytest.approx(1.0, abs=1e-5)  # it integrates
     assert sum(loop.counts.values()) == loop.steps == 700
     moves = np.abs(np.diff([row.r_tilde for row in rows[195:240]]))
-    jumps = np.abs(np.diff([row.r for row in rows[195:240]])) * float(slope)
+    jumps = np.abs(np.diff([row.r for row in rows[195:240]])) / 0.7
     assert np.all(moves <= jumps + 0.4)  # a part of the difference, and the exploration
 
 
@@ -107,7 +109,8 @@ def test_the_others_are_what_the_plant_would_have_done(learned):
         truth = np.array([plant(value) for value in [r[0], *r_tilde[:-1]]])
         told = np.array([math.nan if getattr(row, name) is None else getattr(row, name) for row in rows])
         assert np.isnan(told[:201]).all()
-        np.testing.assert_allclose(told[300:], truth[300:], atol=0.03)  # after where they began
+        end = 401 if name == "y_kept" else None  # then it is the LQ law
+        np.testing.assert_allclose(told[300:end], truth[300:end], atol=0.03)  # after where they began
 
 
 def test_the_replay_holds_what_happened(learned):
@@ -120,10 +123,15 @@ def test_the_replay_holds_what_happened(learned):
     np.testing.assert_allclose(kept["y_next"], [row.y for row in rows[1:]], rtol=1e-5)
     np.testing.assert_allclose(kept["r_next"], [row.r for row in rows[1:]], rtol=1e-5)
     np.testing.assert_array_equal(kept["age"], np.arange(699))
-    offset, slope = (float(value) for value in loop.state.base[:2])
-    np.testing.assert_allclose(
-        offset + slope * kept["r"] + 5.0 * kept["action"], kept["r_tilde"], atol=1e-4
-    )  # also of what was recorded
+    law, n = jax.tree.map(np.asarray, loop.state.base), loop.live.observer.lags
+    base = law.offset + law.r * kept["r"] + law.y * kept["y"]
+    for i in range(1, n + 1):
+        past, applied = (
+            np.concatenate([np.full(i, start), kept[name][:-i]])
+            for name, start in (("y", kept["y"][0]), ("r_tilde", np.clip(kept["y"][0], 0.0, 10.0)))
+        )
+        base = base + law.y_past[i - 1] * (past - kept["y"]) + law.r_tilde_past[i - 1] * applied
+    np.testing.assert_allclose(base + 5.0 * kept["action"], kept["r_tilde"], atol=1e-3)  # also of what was recorded
     moves = np.abs(np.diff(kept["r_tilde"])), np.abs(kept["y_next"] - kept["y"])[1:]
     e, width = np.abs(kept["r"] - kept["y_next"])[1:], 0.003 * np.ptp(loop.live.env.plant.setpoint_range)
     small = np.minimum(e, width)  # rounded at zero
@@ -204,7 +212,7 @@ def test_what_turns_out_worse_is_sent_back(learned):
     again, rows = ran(loop.live, 300, state=state)
     whys = [row.why for row in rows]
     assert whys[0] == "learned"
-    assert whys[-1] == "static"
+    assert whys[-1] == "lq"
     assert again.sent_back == 1
     assert np.abs(rows[-1].r - rows[-1].y) < 2.0
 
