@@ -175,7 +175,7 @@ def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
     (row,), reward = run.metrics, run.summary.reward
     assert row["reward_gentle"] < 0.0
     assert (reward.trained["alpha_g"], reward.reported["alpha_g"], reward.terms) == (0.6, 0.3, ["gentle"])
-    learned, none, _ = run.summary.results
+    learned, none, *_ = run.summary.results
     for each in (learned, none):
         figures = each.scenarios["Gentle/day"]
         assert each.trained_return["Gentle/day"] < figures.episode_return - 0.3 * figures.mae * 40

@@ -2,6 +2,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from types import ModuleType
@@ -494,8 +495,11 @@ def test_processes_do_not_run_the_script_again_that_starts_them_and_are_deaf_to_
 
 
 def test_ctrl_c_while_processes_are_started_is_heard():
-    with interrupts.heard(), pytest.raises(KeyboardInterrupt), jobs._starting():
-        os.kill(os.getpid(), signal.SIGINT)
+    with interrupts.heard(), pytest.raises(KeyboardInterrupt):
+        with jobs._starting():
+            os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1_000):  # a thread that does not block it may take it, and some time over that
+            time.sleep(0.01)
 
 
 def test_one_job_needs_no_other_process(own):

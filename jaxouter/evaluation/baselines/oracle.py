@@ -156,7 +156,8 @@ def kept(actor: Any, base: LinearLaw, settings: dict[str, Any], steps: int) -> T
 def learned(tuned: Tuned) -> LearnedParams:
     """The policy's parameters from what was found."""
     leaves = unflatten_dict({tuple(name.split("/")): jnp.asarray(leaf, float) for name, leaf in tuned.arrays.items()})
-    return LearnedParams(actor=leaves, base=LinearLaw(**leaves.pop(BASE)))
+    base = LinearLaw(**leaves.pop(BASE))
+    return LearnedParams(leaves, base)
 
 
 def build(plant: Plant, tuned: Tuned) -> tuple[LearnedPolicy, LearnedParams]:
