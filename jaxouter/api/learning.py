@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from jaxouter.api.run import Run, load
-from jaxouter.evaluation import figures, pace, scenarios
+from jaxouter.evaluation import pace, scenarios
 from jaxouter.evaluation.baselines import SIMPLE
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import mae, number, reward_terms, trained_return
@@ -414,6 +414,8 @@ def draw(
     drawn: Callable[[], None],
 ) -> None:
     """Write every figure, of each of which `drawn` hears."""
+    from jaxouter.evaluation import figures  # matplotlib takes two seconds, also where nothing is drawn
+
     inner_traces, traces = (
         {name: found.traces for name, found in results.items()} for results in (simple["none"], learned)
     )

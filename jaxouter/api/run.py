@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from jaxouter.evaluation import figures, policies, scenarios
+from jaxouter.evaluation import policies, scenarios
 from jaxouter.evaluation.cache import use_compilation_cache
-from jaxouter.evaluation.drawing import Figure
 from jaxouter.evaluation.policies import NamedPolicy, Results, TrainingSummary
 from jaxouter.exports import files
 from jaxouter.exports.spec import ControllerSpec
@@ -24,6 +23,9 @@ from jaxouter.training.config import TrainConfig
 from jaxouter.training.epochs import Row
 from jaxouter.training.policy import LearnedPolicy
 from jaxouter.training.run import RunFolder, add_agent, add_plant, open_run
+
+if TYPE_CHECKING:
+    from jaxouter.evaluation.drawing import Figure
 
 
 @dataclass(frozen=True, repr=False)
@@ -150,6 +152,8 @@ class Run:
         wanted = scenario or scenarios.reported(self.config.plant)[0]
         (identifier, found), *_ = self.evaluate(wanted, episodes=1, progress=False).items()
         alone = policies.evaluate("none", self.config.plant, identifier, episodes=1, progress=False)
+        from jaxouter.evaluation import figures  # matplotlib takes two seconds, also where nothing is drawn
+
         figure = figures.response(scenarios.get(identifier, 1), alone[identifier].traces, found.traces)
         if path is not None:
             figures.save(figure, Path(path))

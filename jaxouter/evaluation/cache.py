@@ -74,7 +74,7 @@ def use_compilation_cache() -> None:
     terminal.mend_cache()
     if not jax.config.values["jax_compilation_cache_dir"] and (folder := usable()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # there are many small ones
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # there are many small ones
 
 
 @lru_cache(maxsize=1)

@@ -23,9 +23,9 @@ from jaxouter.identification import counterfactual
 from jaxouter.identification.records import Record
 from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.loop.episodes import TrainingEpisodes
-from jaxouter.loop.policy import Linear, LinearLaw, padded
+from jaxouter.loop.policy import Linear, LinearLaw
 from jaxouter.plants import Plant
-from jaxouter.plants.base import RUN_ONCE, excess
+from jaxouter.plants.base import excess
 
 LAGS = (15, 30, 60)
 NOISES = (2e-3, 6e-3, 2e-2, 6e-2)  # standard deviation in the fit; 1 is half the set-point range
@@ -228,7 +228,8 @@ def choose(
         return Choice(static, None, np.inf, np.inf, most)
     held_out = [jax.tree.map(lambda leaf: leaf[3 * len(leaf) // 4 :], model) for model in models]
     settings, laws = zip(*_candidates(plant, whole, tried, NOISES if on is None else (0.0, *NOISES)), strict=True)
-    together = jax.tree.map(lambda *each: jnp.stack(each), *(padded(each, max(tried)) for each in (static, *laws)))
+    numbers = LinearLaw(*map(np.stack, zip(*(_padded(each, max(tried)) for each in (static, *laws)), strict=True)))  # type: ignore[arg-type]
+    together = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), numbers)
     if on is None:
         episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), noise, load)
         replayed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *held_out)
@@ -236,7 +237,6 @@ def choose(
         episodes, replayed = TrainingEpisodes(plant, noise, load), on
     mae, reward, outside = (np.asarray(each, np.float64) for each in _compared(episodes, together, replayed, key))
     responses = [[np.asarray(each[0], np.float64) for each in (model.a, model.b)] for model in models[:PLANTS]]
-    numbers = jax.tree.map(lambda each: np.asarray(each, np.float64), together)
     counts = np.isfinite(mae) & (outside <= outside[0] + WITHIN)
     if on is None:
         counts &= np.max([amplification(numbers, a, b, 2 * steps) for a, b in responses], axis=0) <= NOISIER
@@ -245,6 +245,12 @@ def choose(
         if all(radius(laws[i], a, b) <= 1.0 - REST / plant.episode_steps for a, b in responses):
             return Choice(laws[i], settings[i], float(mae[1 + i]), float(mae[0]), most)
     return Choice(static, None, float(mae[0]), float(mae[0]), most)
+
+
+def _padded(found: LinearLaw, lags: int) -> list[np.ndarray]:
+    """The law's numbers, with zeros for further lags."""
+    offset, r, y, *pasts = (np.asarray(each, np.float64) for each in found)
+    return [offset, r, y, *(np.pad(each, (0, lags - len(each))) for each in pasts)]
 
 
 def _finite(data: Record) -> Record:
@@ -271,7 +277,7 @@ def _candidates(
                 yield Settings(n, noise, price), law(a, b, price * (of_y / of_r_tilde) ** 2)
 
 
-@partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
+@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 1})
 def _compared(
     episodes: TrainingEpisodes, laws: LinearLaw, params: Any, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -495,11 +495,14 @@ def test_processes_do_not_run_the_script_again_that_starts_them_and_are_deaf_to_
 
 
 def test_ctrl_c_while_processes_are_started_is_heard():
-    with interrupts.heard(), pytest.raises(KeyboardInterrupt):
+    def started():
         with jobs._starting():
             os.kill(os.getpid(), signal.SIGINT)
         for _ in range(1_000):  # a thread that does not block it may take it, and some time over that
             time.sleep(0.01)
+
+    with interrupts.heard(), pytest.raises(KeyboardInterrupt):
+        started()
 
 
 def test_one_job_needs_no_other_process(own):
