@@ -18,7 +18,6 @@ MANY = {"n": 1000, "x0_mean": 17.8}
 DEFAULT = {
     "integral_steps": None,
     "reward_scale": 1.0,
-    "reward.rest": 0.1,
     "pretraining.gradient_steps": 2_000,
     "pretraining.noise": 0.02,
     "pretraining.load": 0.2,

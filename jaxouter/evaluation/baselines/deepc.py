@@ -128,7 +128,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     grid = {
         "move_weight": (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0),
         "g_weight": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0),
-        "noise": (0.0, 1e-3, 3e-3, 1e-2),
+        "noise": (0.0, 1e-4, 3e-4, 1e-3, 3e-3),
         "past": [beyond + past for past in (1, 2, 3, 5, 8, 12, 16, 20)],
         "horizon": horizons,
         "margin": (0.0, 1.0, 2.0, 3.0),
@@ -136,7 +136,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
     start = {
         "move_weight": 0.1,
         "g_weight": 1e-2,
-        "noise": 3e-3,
+        "noise": 0.0,
         "past": beyond + 12,
         "horizon": horizons[2],
         "margin": 1.0,
