@@ -101,12 +101,11 @@ def law(a: np.ndarray, b: np.ndarray, price: float) -> LinearLaw:
     """The LQ law of an ARX model: it minimises the sum of (y - r)^2 + price (move of r~)^2.
 
     The state is y - r and the model's own in observer canonical form, driven by moves of r~ and written out in past
-    moves of y and r~ (Goodwin & Sin 1984, section 2.3).
+    moves of y and r~.
 
     Args:
         a, b: (n,), see `fits`.
         price: in (unit of y / unit of r~)^2.
-
     """
     n = len(a)
     A, B, Q = np.zeros((n + 1, n + 1)), np.append(0.0, b)[:, None], np.zeros((n + 1, n + 1))
@@ -132,7 +131,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, price: float) -> np.nda
         B: (n, 1).
         price: positive.
 
-    Source: Chu, Fan, Lin & Wang 2004 (Int. J. Control 77), algorithm 2.1.
+    The structure-preserving doubling algorithm; tested against scipy.
     """
     G, P, one = B @ B.T / price, Q, np.eye(len(A))
     for _ in range(DOUBLINGS):
