@@ -17,6 +17,7 @@ MANY = {"n": 1000, "x0_mean": 17.8}
 
 DEFAULT = {
     "integral_steps": None,
+    "correction": 0.6,
     "reward_scale": 1.0,
     "pretraining.gradient_steps": 2_000,
     "pretraining.noise": 0.02,
@@ -26,6 +27,7 @@ DEFAULT = {
 ROBUST = {
     **DEFAULT,
     "base": "static",
+    "correction": 1.0,
     "history": 20,
     "randomise": (
         ("Pi", 0.3, 18.0),
