@@ -288,7 +288,8 @@ def update(plant: str, name: str) -> Job:
     """Updates alone, all with one batch."""
     trainer, params, config = training(plant, name)
     state, updates = filled(trainer, params), 100
-    batch = off_policy(trainer).batch(state.data, jax.random.bits(state.key, (off_policy(trainer).data.batch_size, 2)))
+    driver = off_policy(trainer)
+    batch = driver.batch(state, params, jax.random.bits(state.key, (driver.data.batch_size, driver.data.bits)))
 
     def run(learner: Any, batch: Any) -> tuple[Any, Any]:
         keys = jax.random.split(jax.random.key(0), updates)
@@ -364,7 +365,7 @@ def first_epoch(config: TrainConfig) -> Callable[[], Any]:
         fleet = Fleet.of(config)
         trainer, params = build(config)
         states = fleet.put([trainer.start(0, params)])
-        if config.epochs:
+        if config.agent_epochs:
             states = fleet.prefill(states, params)
             jax.block_until_ready(fleet.epoch(states, params, 10 * config.environments))
 

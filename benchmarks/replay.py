@@ -31,9 +31,11 @@ def main(preset_name: Literal["paper", "default"] = "paper", updates: int = 300,
     steps = driver.replay.environments * driver.replay.steps
     packed = jax.random.normal(jax.random.key(0), (steps, 2 * size + 3)) * 0.1
 
+    full = state.data._replace(written=jnp.asarray(driver.replay.steps))
+
     def from_windows(key: jax.Array) -> Transitions:
-        bits = jax.random.bits(key, (driver.data.batch_size, 2))
-        return driver.batch(state.data._replace(written=jnp.asarray(driver.replay.steps)), bits)
+        bits = jax.random.bits(key, (driver.data.batch_size, driver.data.bits))
+        return driver.batch(state._replace(data=full), params, bits)
 
     def from_packed(key: jax.Array) -> Transitions:
         rows = packed[jax.random.randint(key, (driver.data.batch_size,), 0, steps)]

@@ -22,6 +22,7 @@ from jaxouter.evaluation.metrics import FiguresOfMerit, number
 from jaxouter.evaluation.policies import TrainingSummary
 from jaxouter.plants.registry import add
 from jaxouter.progress import showing
+from jaxouter.tasks.presets import implied
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Processes, is_first
 from jaxouter.training.epochs import NotFiniteError
@@ -84,9 +85,10 @@ def parse(arguments: list[str]) -> Options:
     given = tyro.cli(Options, prog=program, args=plain, default=first)
     config = given.config
     plant = add(config.plant, config.plant_options, cli.settings(given.set))
-    default = Options(preset(plant, config.preset, agent), agent=agent)
+    name = implied(config.preset, config.base)
+    default = Options(preset(plant, name, agent), agent=agent)
     options = tyro.cli(Options, prog=program, args=arguments, default=default)
-    options = dataclasses.replace(options, config=dataclasses.replace(options.config, plant=plant))
+    options = dataclasses.replace(options, config=dataclasses.replace(options.config, plant=plant, preset=name))
     if options.resume is not None:
         execution = {
             name: getattr(options, name)

@@ -42,7 +42,7 @@ TOLERANCE = 0.05  # relative to the largest of them, on other machines: 50 steps
 PAPER = ["--preset", "paper", "--steps", "205", "--epoch", "5"]  # five updates
 DEFAULT = ["--pretraining.gradient-steps", "50"]
 TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--agent.prefill", "640", "--epoch", "400"]
-TD3 += ["--environments", "8", "--redraw", "0.05", "--agent.noise-end", "0.5", "--agent.n-step", "3"]
+TD3 += ["--environments", "8", "--redraws", "10", "10", "--agent.noise-end", "0.5", "--agent.n-step", "3"]
 TD3 += [
     "--agent.critics",
     "2",

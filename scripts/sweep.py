@@ -33,7 +33,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
     "500-gradient-steps": ("--pretraining.gradient-steps", "500"),
     "16-episodes": ("--pretraining.episodes", "16"),
-    "undisturbed": ("--pretraining.noise", "0", "--pretraining.load", "0"),
+    "undisturbed": ("--disturbances.noise", "0", "--disturbances.load", "0"),
     "then-ddpg-3e-6": (*THEN_DDPG, "--agent.actor-rate", "3e-6"),
     "ddpg-alone": (*DDPG_ALONE, "128000"),
 }

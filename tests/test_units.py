@@ -21,6 +21,7 @@ from jaxouter.evaluation.metrics import figures_of_merit, number
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import rewards
+from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.plants import registry
 from jaxouter.training.policy import LearnedParams
@@ -77,7 +78,7 @@ def test_what_is_learned_from_an_episode_is_the_same():
     def learned(unit: float):
         trainer, params = build(small(f"lag-{unit:g}", history=2))
         state = trainer.fresh(jax.random.key(0), params)
-        rollout = DifferentiableRollout(TrainingEpisodes(trainer.env.plant, 0.02, 0.1), trainer.policy)
+        rollout = DifferentiableRollout(TrainingEpisodes(trainer.env.plant, Disturbances(0.02, 0.1)), trainer.policy)
 
         def cost(actor):
             return rollout.mean_reward(LearnedParams(actor, state.base), params.plant, jax.random.key(1))

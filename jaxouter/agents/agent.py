@@ -31,6 +31,15 @@ class OffPolicy:
     """Environment steps with random actions before the first update."""
     replay: int
     """Environment steps the replay holds."""
+    hold: bool = False
+    """Transitions are as if the set-point had stayed as it was at their first step."""
+    relabel: float = 0.0
+    """Share of transitions that get another set-point; needs `hold`."""
+
+    @property
+    def bits(self) -> int:
+        """Random numbers from which a transition is drawn."""
+        return 4 if self.relabel else 2
 
     @property
     def before(self) -> int:

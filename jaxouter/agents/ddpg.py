@@ -15,7 +15,7 @@ import optax
 
 from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
-from jaxouter.agents.networks import Actor, Critic
+from jaxouter.agents.networks import Actor, Critic, QuadraticCritic
 from jaxouter.agents.noise import ornstein_uhlenbeck
 
 
@@ -25,8 +25,10 @@ class DDPGConfig(AgentConfig):
 
     hidden: tuple[int, ...] = (400, 300)
     """Widths of the hidden layers of actor and critic; at least two."""
+    critic: Literal["mlp", "quadratic"] = "mlp"
+    """mlp: the action enters the critic at its second layer; quadratic: Q is concave in the action, see `networks`."""
     layer_norm: bool = False
-    """LayerNorm in the critic, before each ReLU."""
+    """LayerNorm in the critic mlp, before each ReLU."""
     actor_rate: float = 1e-4
     """Learning rate of the actor (Adam)."""
     critic_rate: float = 1e-3
@@ -61,6 +63,11 @@ class DDPGConfig(AgentConfig):
     """Environment steps with random actions, each held for a while, before the first update."""
     replay: int = 1_000_000
     """Environment steps the replay holds."""
+    hold: bool = False
+    """Learn as if the set-point stayed as it is. Its next value can't be known, and in the target of the critic it is
+    but noise. An n-step return then ends where the set-point moves."""
+    relabel: float = 0.0
+    """Share of transitions that get another set-point, uniform in the plant's range; needs --agent.hold."""
     noise_theta: float = 0.15
     """Mean reversion rate of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
     noise_sigma: tuple[float, float] = (0.2, 0.2)
@@ -71,7 +78,7 @@ class DDPGConfig(AgentConfig):
     @property
     def data(self) -> OffPolicy:
         """Transitions from a replay."""
-        return OffPolicy(self.batch_size, self.n_step, self.discount, self.updates, self.prefill, self.replay)
+        return OffPolicy(**{name: getattr(self, name) for name in OffPolicy.__dataclass_fields__})
 
     def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> DDPG:
         """The learner."""
@@ -92,6 +99,16 @@ class DDPGConfig(AgentConfig):
         for field in ("polyak", "noise_theta"):
             if not 0 < getattr(self, field) <= 1:
                 raise ValueError(f"agent.{field} is {getattr(self, field)}; it must lie in (0, 1]")
+        if self.critic not in ("mlp", "quadratic") or (self.critic == "quadratic" and self.layer_norm):
+            raise ValueError(
+                f"agent.critic is {self.critic!r} and agent.layer_norm is {self.layer_norm}; the critic must be mlp, "
+                "or quadratic without layer_norm"
+            )
+        if not 0 <= self.relabel <= 1 or (self.relabel and not self.hold):
+            raise ValueError(
+                f"agent.relabel is {self.relabel} and agent.hold is {self.hold}; relabel must lie in [0, 1], and be 0 "
+                "without hold"
+            )
         if self.critics not in (1, 2) or self.rate_decay not in ("constant", "cosine"):
             raise ValueError(
                 f"agent.critics is {self.critics} and agent.rate_decay is {self.rate_decay!r}; "
@@ -163,9 +180,10 @@ class DDPG:
         return Actor(self.config.hidden, self.action_size)
 
     @property
-    def critic(self) -> Critic:
+    def critic(self) -> Critic | QuadraticCritic:
         """The critic network."""
-        return Critic(self.config.hidden, self.config.layer_norm)
+        hidden = self.config.hidden
+        return QuadraticCritic(hidden) if self.config.critic == "quadratic" else Critic(hidden, self.config.layer_norm)
 
     def _average(self, found: tuple[jax.Array, Any]) -> tuple[jax.Array, Any, jax.Array]:
         """Loss (0 if not finite) and gradient, averaged over all parts of the batch, and whether the loss is finite."""

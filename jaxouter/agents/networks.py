@@ -35,9 +35,45 @@ class Actor(nn.Module):
         return dense(self.actions, x.shape[-1], 3e-3)(x)
 
 
+def before_tanh(hidden: tuple[int, ...], actor: Any, obs: jax.Array) -> jax.Array:
+    """Output of an actor with one action, before its tanh: obs (..., n) -> (..., 1)."""
+    return cast(jax.Array, Actor(hidden, 1).apply(actor, obs))
+
+
 def act(hidden: tuple[int, ...], actor: Any, obs: jax.Array) -> jax.Array:
-    """Action of an actor with one output: obs (..., n) -> (..., 1) in [-1, 1]."""
-    return jnp.tanh(cast(jax.Array, Actor(hidden, 1).apply(actor, obs)))
+    """Action of an actor with one action: obs (..., n) -> (..., 1) in [-1, 1]."""
+    return jnp.tanh(before_tanh(hidden, actor, obs))
+
+
+class QuadraticCritic(nn.Module):
+    """Q(s, a) = V(s) - 0.1 softplus(P(s)) (10 a - m(s))^2: concave in the action, so no actor runs away from it."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """Obs (..., n), action (..., actions) -> Q (...)."""
+        x, actions = obs, action.shape[-1]
+        for features in self.hidden:
+            x = nn.silu(dense(features, x.shape[-1])(x))
+        x = dense(1 + 2 * actions, x.shape[-1], 3e-3)(x)
+        value, middle, curvature = jnp.split(x, [1, 1 + actions], -1)
+        return value[..., 0] - jnp.sum(0.1 * nn.softplus(curvature) * (10.0 * action - middle) ** 2, -1)
+
+
+class AdvantageCritic(nn.Module):
+    """Gain of a change d of the policy's action, g(s) d - softplus(p(s)) d^2: zero at no change, and concave."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, change: jax.Array) -> jax.Array:
+        """Obs (..., n), change (...) -> gain (...)."""
+        x = obs
+        for features in self.hidden:
+            x = nn.silu(dense(features, x.shape[-1])(x))
+        x = dense(2, x.shape[-1], 3e-3)(x)
+        return x[..., 0] * change - nn.softplus(x[..., 1]) * change**2
 
 
 class Critic(nn.Module):

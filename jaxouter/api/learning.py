@@ -40,6 +40,7 @@ from jaxouter.plants.errors import PlantError
 from jaxouter.plants.registry import REGISTRATIONS, Maker, add, own_errors
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.progress import Progress, clock, showing
+from jaxouter.tasks.presets import implied
 from jaxouter.terminal import Interrupt, optional
 from jaxouter.training import devices, tensorboard
 from jaxouter.training.choice import choose
@@ -141,6 +142,7 @@ def configured(
         )
     of_plant = {key: flat.pop(key) for key in list(flat) if key in PlantOptions.__dataclass_fields__}
     options = PlantOptions(**of_plant)
+    name = implied(name, flat.get("base", "lq"))
     default = preset(add(plant, options, parameters), name, known_agent)
     return from_dict(to_dict(with_options(default, {**flat, "plant_options": options})))  # which looks at types too
 

@@ -22,6 +22,7 @@ import scipy.linalg
 from jaxouter.identification import counterfactual
 from jaxouter.identification.records import Record
 from jaxouter.identification.steady_state import IdentificationWarning
+from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import Linear, LinearLaw
 from jaxouter.plants import Plant
@@ -195,8 +196,7 @@ def choose(
     static: LinearLaw,
     key: chex.PRNGKey,
     history: int,
-    noise: float,
-    load: float,
+    disturbances: Disturbances,
     figure: Figure = "mae",
     on: Any = None,
 ) -> Choice:
@@ -213,7 +213,7 @@ def choose(
         static: the static prefilter.
         key: of the episodes on which laws are compared.
         history: past samples that show the state of the plant and its dead time.
-        noise, load: of these episodes, see `TrainingEpisodes`.
+        disturbances: of these episodes.
         figure: what is best.
         on: parameters of the plant, to compare the laws on the plant itself, whatever they do with measurement noise;
             None: on the record's own model.
@@ -230,10 +230,10 @@ def choose(
     numbers = LinearLaw(*map(np.stack, zip(*(_padded(each, max(tried)) for each in (static, *laws)), strict=True)))  # type: ignore[arg-type]
     together = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), numbers)
     if on is None:
-        episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), noise, load)
+        episodes = TrainingEpisodes(counterfactual.plant(plant, models[0].a.shape[1]), disturbances)
         replayed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *held_out)
     else:
-        episodes, replayed = TrainingEpisodes(plant, noise, load), on
+        episodes, replayed = TrainingEpisodes(plant, disturbances), on
     mae, reward, outside = (np.asarray(each, np.float64) for each in _compared(episodes, together, replayed, key))
     responses = [[np.asarray(each[0], np.float64) for each in (model.a, model.b)] for model in models[:PLANTS]]
     counts = np.isfinite(mae) & (outside <= outside[0] + WITHIN)

@@ -11,7 +11,7 @@ and `default_params` are gymnax's too, except that `params` must always be passe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from jax.custom_batching import custom_vmap
 
 from jaxouter.loop import closed_loop, rewards, sensor
 from jaxouter.loop.closed_loop import LoopState
+from jaxouter.loop.disturbances import UNDISTURBED, Disturbances, Load
 from jaxouter.loop.observation import Memory, Observer
 from jaxouter.loop.references import Goal, SetPoint
 from jaxouter.loop.rewards import RewardConfig, RewardParams
@@ -33,6 +34,7 @@ from jaxouter.plants import make as make_plant
 from jaxouter.plants.registry import Maker, add
 
 RESET = 1  # folded into the key of a step that ends an episode
+DISTURBED = 3  # folded into the key of a reset
 
 
 @struct.dataclass
@@ -44,11 +46,19 @@ class EnvParams:
     reward: RewardParams
 
 
+class Disturbance(NamedTuple):
+    """What disturbs one episode."""
+
+    noise: jax.Array  # standard deviation of the measurement noise, beside the sensor's own
+    load: Load
+
+
 class EnvState(NamedTuple):
     """State of one environment at t_k."""
 
     plant: Any
     plant_params: Any  # drawn at reset; None if the plant draws none
+    disturbance: Disturbance | None  # drawn at reset; None in an environment without any
     goal: Any
     memory: Memory  # of the outer loop, with e_k already integrated
     r: jax.Array  # reference r_k
@@ -65,6 +75,7 @@ class Environment:
     plant: Plant
     observer: Observer
     goal: Goal
+    disturbances: Disturbances = UNDISTURBED
     default_params: EnvParams | None = field(default=None, repr=False, compare=False)
     """The parameters that `make` returned with it. Pass them to compiled functions as an argument: environments that
     differ in nothing else are equal, and share what is compiled."""
@@ -102,10 +113,21 @@ class Environment:
         drawn = None if self.plant.draw is None else self.plant.draw(key_draw, params.plant)
         plant_params = params.plant if drawn is None else drawn
         state = self.plant.training_start(key_start, plant_params)
-        loop = closed_loop.begin(self.plant, plant_params, state, partial(sensor.measure, params.sensor, key_sensor))
+        disturbance = self._disturbance(key)
+        measure = partial(sensor.measure, _disturbed(params.sensor, disturbance), key_sensor)
+        loop = closed_loop.begin(self.plant, plant_params, state, measure)
         goal, r = self.goal.init(key_goal, loop.y_seen)
         memory, obs = self.observer.observe(self.observer.init(r, loop.y_seen), r, loop.y_seen)
-        return obs, EnvState(state, drawn, goal, memory, r, loop.y, loop.y_seen, *jnp.zeros(2, jnp.int32))
+        zeros = jnp.zeros(2, jnp.int32)
+        return obs, EnvState(state, drawn, disturbance, goal, memory, r, loop.y, loop.y_seen, *zeros)
+
+    def _disturbance(self, key: chex.PRNGKey) -> Disturbance | None:
+        """What disturbs an episode, drawn by the key of its reset."""
+        drawn, plant = self.disturbances, self.plant
+        if drawn == UNDISTURBED:
+            return None
+        key_noise, key_load = jax.random.split(jax.random.fold_in(key, DISTURBED))
+        return Disturbance(drawn.noise_level(plant, key_noise), drawn.load_of(plant, key_load, plant.episode_steps))
 
     def _bounded(self, r_tilde: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Clip an output that has diverged (NaN included) to the bounds; the flag ends the episode."""
@@ -127,7 +149,7 @@ class Environment:
 
         Returns:
             obs, state, reward, terminated (y diverged), truncated (the episode has its full length), and info with
-            `final_observation` (obs before any reset), `r` and `y` (its reference and measured output).
+            `final_observation` (obs before any reset), `r`, `y` and `y_true` (its reference, measured and true output).
         """
         if jnp.shape(action) == (1,):  # as the action space has it
             action = action[0]
@@ -137,7 +159,7 @@ class Environment:
         # Before the first step the memory holds a measured y; the reward needs the true one.
         before = jnp.where(state.k == 0, jnp.clip(state.y, *plant.r_tilde_bounds), state.memory.r_tilde_past[0])
         loop = LoopState(state.plant, state.y, state.y_seen, before)
-        measure = partial(sensor.measure, params.sensor, key)
+        measure = partial(sensor.measure, _disturbed(params.sensor, state.disturbance), key)
         loop, reward, terminated = closed_loop.advance(
             plant,
             p,
@@ -148,6 +170,7 @@ class Environment:
             key,
             measure,
             self._bounded,
+            load=0.0 if state.disturbance is None else state.disturbance.load.at(state.k),
             terms=plant.reward_terms,
             held=state.held.astype(state.y.dtype),
         )
@@ -158,8 +181,11 @@ class Environment:
         memory = self.observer.record(state.memory, state.y_seen, loop.r_tilde)
         memory, obs = self.observer.observe(memory, r, loop.y_seen)
         held = jnp.where(r == state.r, state.held + 1, 0)
-        state = EnvState(loop.plant, state.plant_params, goal, memory, r, loop.y, loop.y_seen, state.k + 1, held)
-        return obs, state, reward, terminated, truncated, {"final_observation": obs, "r": r, "y": loop.y_seen}
+        state = state._replace(
+            plant=loop.plant, goal=goal, memory=memory, r=r, y=loop.y, y_seen=loop.y_seen, k=state.k + 1, held=held
+        )
+        info = {"final_observation": obs, "r": r, "y": loop.y_seen, "y_true": loop.y}
+        return obs, state, reward, terminated, truncated, info
 
     def step(
         self, key: chex.PRNGKey, state: EnvState, action: jax.Array, params: EnvParams
@@ -178,6 +204,11 @@ class Environment:
         new = new._replace(plant=self.plant.reuse(after.plant, new.plant))
         obs, after = jax.tree.map(lambda a, b: jnp.where(done, a, b), (new_obs, new), (obs, after))
         return obs, after, reward, terminated, truncated, info
+
+
+def _disturbed(params: SensorParams, disturbance: Disturbance | None) -> SensorParams:
+    """The sensor in an episode."""
+    return params if disturbance is None else replace(params, noise=jnp.hypot(params.noise, disturbance.noise))
 
 
 def _if_any(needed: jax.Array, function: Callable[..., Any], operands: tuple[Any, ...], otherwise: Any) -> Any:
@@ -216,6 +247,7 @@ def make(
     goal: Goal | None = None,
     drawn: Ranges = (),
     reward: RewardConfig = rewards.PAPER,
+    disturbances: Disturbances = UNDISTURBED,
     **overrides: Any,
 ) -> tuple[Environment, EnvParams]:
     """An environment on the training distribution, and its parameters.
@@ -226,6 +258,7 @@ def make(
         goal: reference generator; None: one set-point per episode, as in the paper.
         drawn: parameters to draw at each reset, see `jaxouter.plants.randomised`.
         reward: weights of the reward.
+        disturbances: of each episode.
         **overrides: parameters of the plant.
     """
     name = name if isinstance(name, str) and base(name) in REGISTRY else add(name)
@@ -234,4 +267,4 @@ def make(
         plant, plant_params = randomised(plant, plant_params, drawn)
     goal = SetPoint(*plant.setpoint_range) if goal is None else goal
     params = EnvParams(plant=plant_params, sensor=sensor.params(), reward=rewards.params(plant, reward))
-    return Environment(plant, Observer.of(plant, history, integral_steps), goal, params), params
+    return Environment(plant, Observer.of(plant, history, integral_steps), goal, disturbances, params), params

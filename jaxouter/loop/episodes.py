@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxouter.loop import closed_loop, rewards
+from jaxouter.loop.disturbances import UNDISTURBED, Disturbances
 from jaxouter.loop.policy import Policy
 from jaxouter.loop.references import held, redrawn
 from jaxouter.loop.rewards import RewardConfig
@@ -35,10 +36,7 @@ class TrainingEpisodes:
     """
 
     plant: Plant
-    noise: float = 0.0
-    """Largest standard deviation of measurement noise; 1 is half the set-point range."""
-    load: float = 0.0
-    """Largest load (unseen step added to r~ at a random time); 1 is half the r~ range."""
+    disturbances: Disturbances = UNDISTURBED
     reward: RewardConfig = rewards.PAPER
     """Weights of the reward."""
 
@@ -79,8 +77,7 @@ class TrainingEpisodes:
 
     def level(self, key: chex.PRNGKey) -> jax.Array:
         """Standard deviation of an episode's measurement noise."""
-        low, high = self.plant.setpoint_range
-        return self.noise * (high - low) / 2 * jnp.maximum(0.0, jax.random.uniform(key, (), float, -1.0, 1.0))
+        return self.disturbances.noise_level(self.plant, key)
 
     def noises(self, key: chex.PRNGKey, steps: int) -> jax.Array:
         """Measurement noise (steps,)."""
@@ -89,7 +86,4 @@ class TrainingEpisodes:
 
     def loads(self, key: chex.PRNGKey, steps: int) -> jax.Array:
         """Load on r~ (steps,): zero, then constant from a random time on."""
-        low, high = self.plant.r_tilde_bounds
-        since, size = jax.random.uniform(key, (2,), float, -1.0, 1.0)
-        step = self.load * (high - low) / 2 * jnp.where(since > 0, size, 0.0)
-        return jnp.where(jnp.arange(steps, dtype=float) >= since * steps, step, 0.0)
+        return self.disturbances.load_of(self.plant, key, steps).at(jnp.arange(steps))

@@ -126,6 +126,25 @@ class Observer:
             window.integral[i],
         )
 
+    def held(self, window: Signals, i: int, r: jax.Array) -> Signals:
+        """The window as if the reference had been r from t_i on, and all else as it was.
+
+        Args:
+            window: as for `memory_at`; what follows a reset after t_i has no meaning.
+            i: index in the window.
+            r: reference, scalar.
+        """
+        k = jnp.arange(len(window.r))
+        later = k >= i
+        since = (k[:, None] - k[None]).astype(r.dtype)
+        decay = (1.0 - 1.0 / self.integral_steps) ** jnp.maximum(since, 0.0)
+        weights = jnp.where((since >= 0) & later[None], decay, 0.0) / self.integral_steps
+        return window._replace(
+            r=jnp.where(later, r, window.r),
+            integral=window.integral + weights @ (r - window.r),
+            r_next=jnp.where(later, r, window.r_next),
+        )
+
     def before_and_after(self, window: Signals, i: jax.Array | int, j: jax.Array | int) -> tuple[jax.Array, jax.Array]:
         """Observations at t_i and at t_(j+1), j >= i, the latter before any reset; each (3 + 2H,)."""
         at_i = self.features(self.memory_at(window, i), window.r[i], window.y[i])

@@ -15,6 +15,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+RATE = 1  # folded into the key of the first set-point
 SEGMENTS = 5  # set-points of a staircase, slopes of a ramp
 
 
@@ -144,32 +145,38 @@ class SetPointState(NamedTuple):
 
     key: chex.PRNGKey
     r: jax.Array
+    redraw: jax.Array | None = None  # probability per step
 
 
 @dataclass(frozen=True)
 class SetPoint:
-    """A set-point uniform in [low, high], redrawn at each step with probability `redraw` (the paper's: 0, never)."""
+    """A set-point uniform in [low, high], redrawn at random steps (the paper's: never)."""
 
     low: float
     high: float
-    redraw: float = 0.0
+    redraw: tuple[float, float] = (0.0, 0.0)
+    """Least and greatest probability per step of a redraw, drawn for each episode, log-uniform; 0: never."""
 
     def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[SetPointState, jax.Array]:
         """A first set-point, whatever y0."""
         del y0
         key, draw = jax.random.split(key)
         r = jax.random.uniform(draw, (), float, self.low, self.high)
-        return SetPointState(key, r), r
+        least, greatest = self.redraw
+        if greatest == 0.0:
+            return SetPointState(key, r), r
+        share = jax.random.uniform(jax.random.fold_in(draw, RATE), (), float)
+        return SetPointState(key, r, least * (greatest / least) ** share), r
 
     def step(self, state: SetPointState, y: jax.Array) -> tuple[SetPointState, jax.Array]:
-        """The same set-point, or another with probability `redraw`."""
+        """The same set-point, or another one."""
         del y
-        if self.redraw == 0.0:
+        if state.redraw is None:
             return state, state.r
         key, when, draw = jax.random.split(state.key, 3)
         other = jax.random.uniform(draw, (), float, self.low, self.high)
-        r = jnp.where(jax.random.uniform(when, (), float) < self.redraw, other, state.r)
-        return SetPointState(key, r), r
+        r = jnp.where(jax.random.uniform(when, (), float) < state.redraw, other, state.r)
+        return state._replace(key=key, r=r), r
 
 
 @dataclass(frozen=True)

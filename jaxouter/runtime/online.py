@@ -39,7 +39,7 @@ from jaxouter.runtime.controller import Reason
 from jaxouter.tasks.presets import LIVE
 from jaxouter.training.config import TrainConfig, configured, preset
 from jaxouter.training.environments import TrainState
-from jaxouter.training.off_policy import FIELDS, batch
+from jaxouter.training.off_policy import FIELDS, Windows
 from jaxouter.training.policy import LearnedPolicy
 
 Kept = Literal["static", "lq", "trained"]
@@ -281,7 +281,7 @@ class Live:
         reward = rewards.reward(price, before.r, y, before.y, before.r_tilde, earlier, plant.reward_terms, held)
         action = (before.r_tilde - unclipped(base, before.memory, before.r, before.y)) / self.policy.scale
         never = jnp.zeros_like(y)
-        return jnp.stack([*signals, action, self.reward_scale * reward, never, never])
+        return jnp.stack([*signals, action, self.reward_scale * reward, never, never, held, before.y, y])
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def write(self, replay: ReplayState, rows: jax.Array) -> ReplayState:
@@ -306,11 +306,13 @@ class Live:
         return replay._replace(rows=jnp.concatenate([rings[:, rings.shape[1] - mirror :], rings], 1))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
-    def update(self, agent: Any, replay: ReplayState, key: chex.PRNGKey, number: jax.Array) -> Any:
+    def update(self, agent: Any, replay: ReplayState, base: LinearLaw, key: chex.PRNGKey, number: jax.Array) -> Any:
         """Update `number` (uint32) of the agent, from the replay."""
         key_batch, key_update = jax.random.split(jax.random.fold_in(key, number))
-        bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
-        transitions = batch(self.replay, self.observer, self.data.discount, replay, bits)
+        bits = jax.random.bits(key_batch, (self.data.batch_size, self.data.bits), jnp.uint32)
+        plant = self.env.plant
+        windows = Windows(self.replay, self.data, self.policy, plant, self.reward_scale)
+        transitions = windows.batch(replay, base, rewards.params(plant, self.reward), bits)
         return self.agent.update(agent, transitions, key_update)[0]
 
     def identify(self, replay: ReplayState) -> tuple[LinearLaw, Response]:

@@ -210,7 +210,7 @@ class Loop:
                 self._longest = max(self._fastest, FORGET * self._longest)
                 break
             number = np.uint32(self._updates)
-            agent = self.live.update(self._state.agent, self._state.replay, self._state.key, number)
+            agent = self.live.update(self._state.agent, self._state.replay, self._state.base, self._state.key, number)
             self._state = self._state._replace(agent=jax.block_until_ready(agent))
             self._updates += 1
             self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
@@ -331,7 +331,7 @@ class Loop:
         agent, took = jax.tree.map(jnp.copy, self._state.agent), []
         for _ in range(10):
             begun = self._clock()
-            agent = self.live.update(agent, self._state.replay, self._state.key, np.uint32(0))
+            agent = self.live.update(agent, self._state.replay, self._state.base, self._state.key, np.uint32(0))
             jax.block_until_ready(agent)
             took.append(self._clock() - begun)
         if min(took) > (1.0 - RESERVE) * self.settings.dt:

@@ -15,19 +15,30 @@ NOISE_SEEDS = 32
 HOUSES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
 MANY = {"n": 1000, "x0_mean": 17.8}
 
-DEFAULT = {
-    "integral_steps": None,
+HOURLY = {"integral_steps": None, "reward_scale": 1.0, "agent.discount": 0.95}
+RECORD = {
+    **HOURLY,
     "correction": 0.6,
-    "reward_scale": 1.0,
     "pretraining.gradient_steps": 2_000,
-    "pretraining.noise": 0.02,
-    "pretraining.load": 0.2,
-    "agent.discount": 0.95,
+    "disturbances.noise": 0.02,
+    "disturbances.load": 0.2,
+}
+DEFAULT = {**RECORD, "pairs.change": 0.1}
+SCRATCH = {
+    **HOURLY,
+    "agent.n_step": 3,
+    "agent.updates": 3,
+    "agent.noise_sigma": (0.005, 0.05),
+    "pairs.change": 0.08,
+    "pairs.horizon": 24,
 }
 ROBUST = {
-    **DEFAULT,
+    **RECORD,
     "base": "static",
     "correction": 1.0,
+    "redraws": (0.0, 0.0),
+    "pairs.rounds": 0,
+    "compared": 0,
     "history": 20,
     "randomise": (
         ("Pi", 0.3, 18.0),
@@ -81,7 +92,7 @@ def _heterogeneity(params: Any, repeats: int, spread: jax.Array) -> Any:
 
 HEATERS = Task(
     make=heaters.make,
-    presets={"default": DEFAULT, "robust": ROBUST, "paper": {"steps": 400_000}},
+    presets={"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "robust": ROBUST, "paper": {"steps": 400_000}},
     scenarios={
         "paper-4": Scenario(SETPOINTS, episodes=NOISE_SEEDS, paper=(15.62, 1.17)),
         "paper-1000": Scenario(SETPOINTS, MANY, episodes=NOISE_SEEDS, paper=(15.07, 1.31)),

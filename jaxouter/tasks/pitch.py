@@ -16,9 +16,14 @@ NOISE_SEEDS = 32
 DELAYED = (10.13, 2.46)  # the paper's only delayed case; no reading of it gives 10.13 exactly
 
 # The linear law is nearly the best there is: small corrections, for which moves of r~ cost nothing.
-DEFAULT = {"correction": 0.1, "reward.beta_h": 0.0}
+RECORD = {"correction": 0.1, "reward.beta_h": 0.0}
+DEFAULT = RECORD
 ROBUST = {
     "base": "static",
+    "correction": 1.0,
+    "redraws": (0.0, 0.0),
+    "pairs.rounds": 0,
+    "compared": 0,
     "history": 80,  # longer than the longest delay
     "randomise": (
         ("tau", 0.3, 0.7),
@@ -58,7 +63,7 @@ def _vary(*names: str, longest: float | None = None) -> Any:
 # The longest delay sets the length of the delay lines, and with it the cost of a step: keep it short.
 PITCH = Task(
     make=pitch.make,
-    presets={"default": DEFAULT, "robust": ROBUST, "paper": {}},
+    presets={"default": DEFAULT, "scratch": {}, "record": RECORD, "robust": ROBUST, "paper": {}},
     scenarios={
         "paper": Scenario((SETPOINT,), paper=(10.91, 3.90)),
         "delay-0.57": _delayed(0.57, 0.57),

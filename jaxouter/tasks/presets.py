@@ -1,4 +1,4 @@
-"""Presets that every plant has. `paper` is the paper's training; `default` gives the best results known."""
+"""Presets that every plant has."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from jaxouter.tasks.task import Options
 
-PAPER: Options = {"agent": "ddpg", "agent.prefill": 200, "base": "absolute"}
-DEFAULT: Options = {
+PAPER: Options = {"agent": "ddpg", "agent.prefill": 200, "base": "absolute", "compared": 0}
+RECORD: Options = {
     "steps": 0,
     "environments": 16,
     "epoch": 6_000,
@@ -16,12 +16,13 @@ DEFAULT: Options = {
     "reward.huber": 0.003,
     "reward.rest": 0.05,
     "integral_steps": 20.0,
+    "disturbances.noise": 0.015,
+    "disturbances.load": 0.1,
     "pretraining.gradient_steps": 1_500,
-    "pretraining.noise": 0.015,
-    "pretraining.load": 0.1,
     "agent": "ddpg",
     "agent.hidden": (128, 128),
-    "agent.layer_norm": True,
+    "agent.critic": "quadratic",
+    "agent.hold": True,
     "agent.actor_rate": 3e-4,
     "agent.critic_rate": 1e-3,
     "agent.rate_decay": "cosine",
@@ -35,10 +36,40 @@ DEFAULT: Options = {
     "agent.replay": 200_000,
     "agent.noise_sigma": (0.0125, 0.1),
 }
-PRESETS: Mapping[str, Options] = {"default": DEFAULT, "paper": PAPER}
+DEFAULT: Options = {
+    **RECORD,
+    "correction": 0.2,
+    "redraws": (1.0, 20.0),
+    "pretraining.gradient_steps": 0,
+    "pairs.rounds": 30,
+}
+SCRATCH: Options = {
+    **RECORD,
+    "base": "static",
+    "redraws": (1.0, 20.0),
+    "pretraining.gradient_steps": 0,
+    "steps": 332_800,  # 26 episodes of each environment
+    "environments": 64,
+    "epoch": 12_800,
+    "agent.n_step": 5,
+    "agent.updates": 2,
+    "agent.prefill": 12_800,
+    "agent.replay": 102_400,
+    "agent.noise_sigma": (0.005, 0.03),
+    "pairs.rounds": 20,
+    "pairs.change": 0.04,
+    "pairs.actor_rate": 3e-4,
+    "pairs.noise_sigma": (0.005, 0.03),
+}
+PRESETS: Mapping[str, Options] = {"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "paper": PAPER}
 LIVE: Options = {  # an unknown plant in real time: an update must fit into milliseconds
-    **DEFAULT,
+    **RECORD,
     "agent.hidden": (64, 64),
     "agent.batch_size": 128,
     "agent.discount": 0.95,
 }
+
+
+def implied(preset: str, base: str) -> str:
+    """The preset that a choice of the base law implies: without the LQ law `default` is `scratch`."""
+    return "scratch" if preset == "default" and base != "lq" else preset

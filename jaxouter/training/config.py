@@ -13,7 +13,9 @@ import tyro
 
 from jaxouter import agents, plants, tasks
 from jaxouter.agents import AgentConfig
+from jaxouter.agents.pairs import SHARES, PairsConfig
 from jaxouter.identification.steady_state import LEVELS
+from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
@@ -39,10 +41,6 @@ class PretrainingConfig:
     """Past samples of r~ and y in the model; None: as in the observation, or more if the dead time needs them."""
     batch_size: int = 64
     """Episodes on the model per gradient step."""
-    noise: float = 0.0
-    """Largest standard deviation of measurement noise, which half of these have; 1 is half the set-point range."""
-    load: float = 0.0
-    """Largest load (unseen step added to r~ at a random time), which half of these have; 1 is half the r~ range."""
     log_above: float = 0.0
     """c > 0: an episode's cost per step counts as c log(1 + cost / c); 0: it counts in full.
     This way episodes on plants that are hard to control don't outweigh all others."""
@@ -51,9 +49,8 @@ class PretrainingConfig:
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
         if self.gradient_steps < 0:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
-        for name in ("noise", "load", "log_above"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must not be negative")
+        if self.log_above < 0:
+            raise ValueError(f"pretraining.log_above is {self.log_above}; it must not be negative")
         for name in ("episodes", "plants", "episode_steps", "lags", "batch_size"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must be at least 1")
@@ -66,7 +63,9 @@ class TrainConfig:
     plant: Annotated[str, tyro.conf.Positional]
     """Plant to learn on: pitch, heaters, FILE.py:NAME (your own), gym:ID, fmu:FILE or log:FILE."""
     preset: str
-    """Preset that supplies the defaults: default, paper; for pitch and heaters also robust."""
+    """Preset that supplies the defaults: default (the LQ law of a record, bettered by reinforcement learning), scratch
+    (reinforcement learning alone, as with --base static), record (pretraining alone), paper; for pitch and heaters also
+    robust."""
     agent: AgentConfig
     """Settings of the learning algorithm; --agent NAME chooses another."""
     seed: int = 0
@@ -86,8 +85,9 @@ class TrainConfig:
     """Past samples of y and r~ in the observation; None: as the plant declares, or else chosen by its dead time."""
     integral_steps: float | None = None
     """Time constant of the leaky integral, in control steps; None: a quarter of an episode."""
-    redraw: float = 0.0
-    """Probability at each control step that the set-point is redrawn within an episode."""
+    redraws: tuple[float, float] = (0.0, 0.0)
+    """Least and greatest number of redraws of the set-point in an episode, on average; drawn for each episode,
+    log-uniform. 0 0: never."""
     randomise: plants.Ranges = ()
     """Parameters of the plant drawn for each episode: name, least, greatest value, repeated for each."""
     base: Base = "lq"
@@ -99,6 +99,13 @@ class TrainConfig:
     """Factor on the reward (in the plant's error scales) that the agent learns from."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward that is trained on."""
+    disturbances: Disturbances = field(default_factory=Disturbances)
+    """Noise and loads that half of the training episodes have, whoever learns from them."""
+    pairs: PairsConfig = field(default_factory=PairsConfig)
+    """Rounds of learning from pairs, after the agent's own steps; only a better actor is kept."""
+    compared: int = 512
+    """Fresh training episodes on which an actor of a round of pairs must be better than the one before, and in the end
+    what was learned better than the base law alone, which else remains; 0: no check in the end."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
     """Control steps spent to identify the dead time, for settings that were not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
@@ -122,6 +129,8 @@ class TrainConfig:
                 raise ValueError(f"{name} is {value}; it must be a number between -{HUGE:,} and {HUGE:,}")
         self.pretraining.check()
         self.reward.check()
+        self.disturbances.check()
+        self.pairs.check()
         self.agent.check()
         if (self.pretraining.plants > 1) and not self.randomise:
             raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
@@ -133,8 +142,10 @@ class TrainConfig:
         for name in ("seeds", "devices", "environments", "epoch", "reward_scale", "correction"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
-        if self.steps < 0 or not (self.steps or self.pretraining.gradient_steps):
-            raise ValueError(f"steps is {self.steps}; it must be positive, or 0 with pretraining")
+        if self.steps < 0 or not (self.steps or self.pretraining.gradient_steps or self.pairs.rounds):
+            raise ValueError(f"steps is {self.steps}; it must be positive, or 0 with pretraining or rounds of pairs")
+        if self.compared < 0 or (self.pairs.rounds and not self.compared):
+            raise ValueError(f"compared is {self.compared}; it must be positive, or 0 without rounds of pairs")
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; it must not be negative")
         if self.steps % self.environments:
@@ -149,8 +160,9 @@ class TrainConfig:
                 f"the {self.seeds} seeds gets of {self.devices}"
             )
         self.agent.data.check(self.steps, self.epoch, self.environments, self.shards)
-        if not 0 <= self.redraw <= 1:
-            raise ValueError(f"redraw is {self.redraw}; it must lie in [0, 1]")
+        low, high = self.redraws
+        if not (low == high == 0 or 0 < low <= high):
+            raise ValueError(f"redraws is {self.redraws}; it must be 0 0, or two positive numbers in ascending order")
         return self
 
     @property
@@ -164,9 +176,30 @@ class TrainConfig:
         return self.devices // self.side_by_side
 
     @property
-    def epochs(self) -> int:
-        """Epochs after the prefill; the last one may be shorter."""
+    def agent_epochs(self) -> int:
+        """Epochs of the agent, after the prefill; the last one may be shorter."""
         return max(0, -(-(self.steps - self.agent.data.before) // self.epoch))
+
+    @property
+    def epochs(self) -> int:
+        """Epochs in all: those of the agent, then each round of pairs, then the check."""
+        return self.agent_epochs + self.pairs.rounds + (self.compared > 0)
+
+    def steps_of(self, epoch: int, episode_steps: int) -> tuple[int, int]:
+        """Control steps of the plant and updates of an epoch, given the length of the plant's episodes."""
+        if epoch < self.agent_epochs:
+            steps = min(self.epoch, self.steps - self.agent.data.before - epoch * self.epoch)
+            return steps, self.agent_updates * steps // (self.steps - self.agent.data.before)
+        if epoch < self.agent_epochs + self.pairs.rounds:
+            compared = (1 + len(SHARES)) * self.compared * episode_steps
+            return self.pairs.steps(episode_steps) + compared, self.pairs.updates_per_round
+        return 2 * self.compared * episode_steps, 0
+
+    def done_by(self, epoch: int, episode_steps: int) -> tuple[int, int]:
+        """The same of all epochs until then, the prefill included."""
+        of_each = [self.steps_of(each, episode_steps) for each in range(epoch)]
+        prefill = self.agent.data.before if epoch and self.agent_epochs else 0
+        return prefill + sum(steps for steps, _ in of_each), sum(updates for _, updates in of_each)
 
     @property
     def identification_steps(self) -> int:
@@ -186,12 +219,17 @@ class TrainConfig:
     @property
     def environment_steps(self) -> int:
         """Control steps of the plant per seed, identification included."""
-        return self.steps + self.identification_steps
+        return self.done_by(self.epochs, plants.make(self.plant)[0].episode_steps)[0] + self.identification_steps
+
+    @property
+    def agent_updates(self) -> int:
+        """Updates of the agent per seed."""
+        return self.agent.data.total_updates(self.steps, self.environments)
 
     @property
     def total_updates(self) -> int:
-        """Gradient updates per seed."""
-        return self.agent.data.total_updates(self.steps, self.environments)
+        """Gradient updates per seed, after the pretraining."""
+        return self.agent_updates + self.pairs.rounds * self.pairs.updates_per_round
 
 
 def preset(plant: str, name: str = "default", agent: str | None = None) -> TrainConfig:
@@ -275,7 +313,8 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     Raises:
         ValueError: a field is missing, unknown or of the wrong type, or the agent is unknown.
     """
-    parts = {"plant_options": PlantOptions, "pretraining": PretrainingConfig, "reward": RewardConfig}
+    parts = {"plant_options": PlantOptions, "pretraining": PretrainingConfig}
+    parts |= {"reward": RewardConfig, "disturbances": Disturbances, "pairs": PairsConfig}
     for name in ("agent", *parts):
         if not isinstance(values.get(name), dict):
             raise ValueError(f"{name} is {values.get(name)!r}; it must be an object with its fields")

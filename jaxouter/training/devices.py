@@ -234,6 +234,7 @@ class Fleet:
             base=SEED,
             key=SEED,
             steps=SEED,
+            pairs=SEED,
         )
 
     def _place(self, spec: P, leaves: Sequence[Any]) -> jax.Array:
@@ -252,6 +253,16 @@ class Fleet:
         return _jitted(self)[0]
 
     @property
+    def improve(self) -> jax.stages.Wrapped:
+        """`Trainer.improve` for every seed, `improve(states, params) -> states, metrics`; donates the states."""
+        return _jitted(self)[2]
+
+    @property
+    def check(self) -> jax.stages.Wrapped:
+        """`Trainer.check` for every seed, `check(states, params) -> states, metrics`; donates the states."""
+        return _jitted(self)[3]
+
+    @property
     def epoch(self) -> jax.stages.Wrapped:
         """`Trainer.epoch` for every seed, `epoch(states, params, steps) -> states, metrics`, metrics (seeds,).
 
@@ -261,7 +272,7 @@ class Fleet:
 
 
 @cache  # so that equal fleets share compiled functions
-def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
+def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, ...]:
     def mapped(function: Callable[..., Any], out_specs: Any) -> Callable[..., Any]:
         def of_one(states: TrainState, params: EnvParams) -> Any:
             state = jax.tree.map(lambda leaf: jnp.squeeze(leaf, 0), states)
@@ -280,17 +291,22 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
     def prefill(states: TrainState, params: EnvParams) -> TrainState:
         return mapped(fleet.trainer.prefill, fleet.layout)(states, params)
 
-    @partial(
-        jax.jit,
-        static_argnums=2,
-        donate_argnums=0,
-        out_shardings=(layout, NamedSharding(fleet.mesh, SEED)),
-        compiler_options=EIGEN if on_cpu else None,
-    )
+    with_metrics = (layout, NamedSharding(fleet.mesh, SEED))
+    options = EIGEN if on_cpu else None
+
+    @partial(jax.jit, static_argnums=2, donate_argnums=0, out_shardings=with_metrics, compiler_options=options)
     def epoch(states: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         return mapped(lambda *given: fleet.trainer.epoch(*given, steps), (fleet.layout, SEED))(states, params)
 
-    return prefill, epoch
+    @partial(jax.jit, donate_argnums=0, out_shardings=with_metrics, compiler_options=options)
+    def improve(states: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        return mapped(fleet.trainer.improve, (fleet.layout, SEED))(states, params)
+
+    @partial(jax.jit, donate_argnums=0, out_shardings=with_metrics, compiler_options=RUN_ONCE)
+    def check(states: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        return mapped(fleet.trainer.check, (fleet.layout, SEED))(states, params)
+
+    return prefill, epoch, improve, check
 
 
 def spread(tree: Tree, members: int, devices: int) -> Tree:

@@ -29,7 +29,8 @@ class TrainState(NamedTuple):
     noise: Any  # (E, ...), state of the exploration noise
     base: LinearLaw  # base law of the policy
     key: chex.PRNGKey
-    steps: jax.Array  # int32, environment steps so far
+    steps: jax.Array  # int32, environment steps of the agent so far
+    pairs: Any = ()  # of the rounds of pairs
 
 
 class Step(NamedTuple):
@@ -37,6 +38,9 @@ class Step(NamedTuple):
 
     signals: Signals
     action: jax.Array  # (E,)
+    held: jax.Array  # (E,), control steps since r last changed
+    y: jax.Array  # (E,), true output before the step
+    y_next: jax.Array  # (E,), and after it, before any reset
     reward: jax.Array  # (E,), in the learner's scale
     terminated: jax.Array  # (E,), bool
     truncated: jax.Array  # (E,), bool
@@ -142,7 +146,9 @@ class Environments:
         )
         state = state._replace(env=env, obs=obs, steps=state.steps + self.total)
         scaled = reward * self.reward_scale
-        return state, Step(signals, action, scaled, terminated, truncated, reward, info["final_observation"])
+        outputs = before.held.astype(reward.dtype), before.y, info["y_true"]
+        ended = terminated, truncated, reward, info["final_observation"]
+        return state, Step(signals, action, *outputs, scaled, *ended)
 
     def expectations(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
         """Expected and actual return of fresh training episodes.

@@ -121,8 +121,9 @@ def train(
     def keep(seed: int, state: TrainState, epoch: int, metrics: Row, rates: Row) -> None:
         if epoch == 0 and run.rows(seed):
             return  # written before the run was killed
-        row: Row = {"epoch": epoch, "steps": int(state.steps), "updates": trainer.updates(state), **metrics}
-        if epoch > 0:
+        steps, updates = cfg.done_by(epoch, trainer.env.plant.episode_steps)
+        row: Row = {"epoch": epoch, "steps": steps, "updates": updates, **metrics}
+        if 0 < epoch <= cfg.agent_epochs:
             row |= {name: float(value) for name, value in trainer.diagnose(state, params).items()}
         row |= on_epoch(trainer, state) | rates
         run.append(seed, row)
@@ -135,18 +136,23 @@ def train(
             devices.in_first(partial(keep, seed, state, 0, {}, rates))
         pace.do(partial(save, 0))
     for epoch in range(done, cfg.epochs):
-        if epoch == done:
+        if epoch in (done, cfg.agent_epochs, cfg.agent_epochs + cfg.pairs.rounds):
             say("compiling", 0, 0)
-        steps = min(cfg.epoch, cfg.steps - cfg.agent.data.before - epoch * cfg.epoch)
+        steps, updates = cfg.steps_of(epoch, trainer.env.plant.episode_steps)
         for seeds in rounds:
             begun = time.perf_counter()
-            states[seeds], metrics = fleet.epoch(states[seeds], params, steps)
+            if epoch < cfg.agent_epochs:
+                states[seeds], metrics = fleet.epoch(states[seeds], params, steps)
+            elif epoch < cfg.agent_epochs + cfg.pairs.rounds:
+                states[seeds], metrics = fleet.improve(states[seeds], params)
+            else:
+                states[seeds], metrics = fleet.check(states[seeds], params)
             metrics = devices.get(metrics)  # waits for the epoch to end
             seconds = time.perf_counter() - begun
             rates = {
                 "seconds": seconds,
                 "steps_per_second": steps / seconds,
-                "updates_per_second": cfg.total_updates / (cfg.steps - cfg.agent.data.before) * steps / seconds,
+                "updates_per_second": updates / seconds,
             }
             for i, (seed, state) in enumerate(zip(seeds, fleet.take(states[seeds]), strict=True)):
                 _check(seed, epoch + 1, state)
@@ -189,7 +195,7 @@ def _begin(
         return trainer.start(seed, params, partial(report, seed), run.load_pretraining(seed), each, say)
 
     states = run.fleet.put([devices.state_from_first(lambda seed=seed: whole(seed), like) for seed in seeds])
-    if loads or not run.config.epochs:
+    if loads or not run.config.agent_epochs:
         return states
     say("prefill", 0, 0)
     return run.fleet.prefill(states, params)

@@ -8,16 +8,78 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxouter.agents.agent import OffPolicy, OffPolicyAgent, Transitions
 from jaxouter.agents.replay import Replay, ReplayState
 from jaxouter.agents.returns import n_step_return
+from jaxouter.loop import rewards
 from jaxouter.loop.environment import EnvParams
-from jaxouter.loop.observation import Observer, Signals
+from jaxouter.loop.observation import Signals
+from jaxouter.loop.policy import LinearLaw
+from jaxouter.loop.rewards import RewardParams
+from jaxouter.plants import Plant
 from jaxouter.training.environments import AXIS, Environments, Step, TrainState
+from jaxouter.training.policy import LearnedPolicy
 
-FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated")
+FIELDS = (*Signals._fields, "action", "reward", "terminated", "truncated", "held", "y_true", "y_true_next")
+MOVED = 0.02  # share of the set-point range by which r moves at least where a window ends
 HOLD = 0.1  # probability per step that the random action of the prefill is redrawn
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Builds transitions from windows of a replay. Static and hashable."""
+
+    replay: Replay
+    data: OffPolicy  # with the batch size of one shard
+    policy: LearnedPolicy
+    plant: Plant
+    reward_scale: float
+
+    def batch(self, replay: ReplayState, base: LinearLaw, price: RewardParams, bits: jax.Array) -> Transitions:
+        """Transitions chosen by random bits (B, `data.bits`), uint32; `base` and `price` serve those that are held."""
+        windows, _ = self.replay.sample(replay, bits)
+        return jax.vmap(lambda rows, bits: self._transition(rows, bits, base, price))(windows, bits)
+
+    def _transition(self, rows: jax.Array, bits: jax.Array, base: LinearLaw, price: RewardParams) -> Transitions:
+        field = dict(zip(FIELDS, rows.T, strict=True))
+        first, observer = self.replay.lead, self.policy.observer
+        window = Signals(*(field[name] for name in Signals._fields))
+        reward, action = field["reward"][first:], field["action"][first]
+        terminated, cut = field["terminated"][first:] > 0, field["truncated"][first:] > 0
+        if self.data.hold:
+            r = self._set_point(window.r[first], bits)
+            action = action - base.r * (r - window.r[first]) / self.policy.scale
+            cut |= jnp.abs(window.r_next[first:] - r) > MOVED * np.ptp(self.plant.setpoint_range)
+            reward = self._rewards(field, r, price)
+            window = observer.held(window, first, r)
+        total, bootstrap, used = n_step_return(reward, terminated, cut, self.data.discount)
+        obs, next_obs = observer.before_and_after(window, first, first + used)
+        return Transitions(obs, action[None], total, bootstrap, next_obs)
+
+    def _set_point(self, r: jax.Array, bits: jax.Array) -> jax.Array:
+        """The set-point of a transition: r, or another one."""
+        if not self.data.relabel:
+            return r
+        low, high = self.plant.setpoint_range
+        chance, share = bits[2:].astype(r.dtype) / 2.0**32
+        return jnp.where(chance < self.data.relabel, low + share * (high - low), r)
+
+    def _rewards(self, field: dict[str, jax.Array], r: jax.Array, price: RewardParams) -> jax.Array:
+        """Rewards of the window's steps, as if the set-point had stayed r."""
+        first, plant = self.replay.lead, self.plant
+        y, y_next, r_tilde = (field[name][first:] for name in ("y_true", "y_true_next", "r_tilde"))
+        begins = field["age"][first:] == 0
+        before = jnp.where(begins, jnp.clip(y, *plant.r_tilde_bounds), field["r_tilde"][first - 1 : -1])
+        held = field["held"][first] + jnp.arange(len(y), dtype=y.dtype)
+
+        def reward(*of_step: jax.Array) -> jax.Array:
+            y_next, y, r_tilde, before, held = of_step
+            return rewards.reward(price, r, y_next, y, r_tilde, before, plant.reward_terms, held)
+
+        found = jax.vmap(reward)(y_next, y, r_tilde, before, held)
+        return self.reward_scale * (found + jnp.where(field["terminated"][first:] > 0, price.divergence, 0.0))
 
 
 @dataclass(frozen=True)
@@ -26,8 +88,17 @@ class OffPolicyDriver:
 
     environments: Environments
     agent: OffPolicyAgent
-    data: OffPolicy  # with the batch size of one shard
-    replay: Replay  # of one shard
+    windows: Windows  # of one shard
+
+    @property
+    def data(self) -> OffPolicy:
+        """What is learned from, with the batch size of one shard."""
+        return self.windows.data
+
+    @property
+    def replay(self) -> Replay:
+        """The layout of the replay of one shard."""
+        return self.windows.replay
 
     def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         """State before the prefill, with an empty replay."""
@@ -42,16 +113,16 @@ class OffPolicyDriver:
     def row(step: Step) -> jax.Array:
         """Rows (E, width) of the replay."""
         flags = [flag.astype(step.reward.dtype) for flag in (step.terminated, step.truncated)]
-        return jnp.stack([*step.signals, step.action, step.reward, *flags], -1)
+        return jnp.stack([*step.signals, step.action, step.reward, *flags, step.held, step.y, step.y_next], -1)
 
-    def batch_of(self, state: TrainState) -> Transitions:
+    def batch_of(self, state: TrainState, params: EnvParams) -> Transitions:
         """Shapes of the batch of an update."""
-        bits = jax.ShapeDtypeStruct((self.data.batch_size, 2), jnp.uint32)
-        return jax.eval_shape(self.batch, state.data, bits)
+        bits = jax.ShapeDtypeStruct((self.data.batch_size, self.data.bits), jnp.uint32)
+        return jax.eval_shape(self.batch, state, params, bits)
 
-    def batch(self, replay: ReplayState, bits: jax.Array) -> Transitions:
-        """A batch of transitions built from windows of signals, chosen by random bits (B, 2), uint32."""
-        return batch(self.replay, self.environments.env.observer, self.data.discount, replay, bits)
+    def batch(self, state: TrainState, params: EnvParams, bits: jax.Array) -> Transitions:
+        """A batch of transitions built from windows of signals, chosen by random bits (B, `data.bits`), uint32."""
+        return self.windows.batch(state.data, state.base, params.reward, bits)
 
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
         """Fill the replay with random actions, each held for ten steps on average."""
@@ -82,9 +153,9 @@ class OffPolicyDriver:
         """
         every, data = self.environments, self.data
         keys_noise, keys_env, keys_batch, keys_update = every.keys(state, steps // every.total, 4)
-        shape = (data.updates, data.batch_size, 2)
+        shape = (data.updates, data.batch_size, data.bits)
         bits = jax.vmap(lambda key: jax.random.bits(key, shape, jnp.uint32))(keys_batch)
-        gathered = jax.vmap(self.batch, (None, 0))
+        gathered = jax.vmap(lambda replay, bits: self.windows.batch(replay, state.base, params.reward, bits), (None, 0))
         xs = (
             every.normals(keys_noise),
             every.each(keys_env),
@@ -124,8 +195,8 @@ class OffPolicyDriver:
             and `Environments.expectations`.
         """
         key_batch, key_update, key_run = jax.random.split(key, 3)
-        bits = jax.random.bits(key_batch, (self.data.batch_size, 2), jnp.uint32)
-        found = self.agent.diagnose(state.agent, self.batch(state.data, bits), key_update)
+        bits = jax.random.bits(key_batch, (self.data.batch_size, self.data.bits), jnp.uint32)
+        found = self.agent.diagnose(state.agent, self.batch(state, params, bits), key_update)
         expected = self.environments.expectations(key_run, state, params)
         rows = jnp.minimum(state.data.written, self.replay.steps).astype(expected["q_start"].dtype)
         return found | {"replay_age": self.environments.count * (rows - 1.0) / 2.0} | expected
@@ -138,27 +209,3 @@ def step_metrics(taken: Step, finite: jax.Array) -> dict[str, jax.Array]:
         "diverged": jnp.mean(jnp.where(taken.terminated, 1.0, 0.0)),
         "no_action": jnp.mean(jnp.where(finite, 0.0, 1.0)),
     }
-
-
-def batch(layout: Replay, observer: Observer, discount: float, replay: ReplayState, bits: jax.Array) -> Transitions:
-    """Transitions built from windows of signals.
-
-    Args:
-        layout, replay: the replay.
-        observer: builds the observations.
-        discount: of the n-step returns.
-        bits: random bits, (B, 2), uint32.
-    """
-    windows, _ = layout.sample(replay, bits)
-
-    def transition(rows: jax.Array) -> Transitions:
-        field = dict(zip(FIELDS, rows.T, strict=True))
-        signals = Signals(*(field[name] for name in Signals._fields))
-        first = layout.lead
-        reward, bootstrap, used = n_step_return(
-            field["reward"][first:], field["terminated"][first:] > 0, field["truncated"][first:] > 0, discount
-        )
-        obs, next_obs = observer.before_and_after(signals, first, first + used)
-        return Transitions(obs, field["action"][first][None], reward, bootstrap, next_obs)
-
-    return jax.vmap(transition)(windows)

@@ -35,8 +35,9 @@ class OnPolicyDriver:
         del seed, environment
         return ()
 
-    def batch_of(self, state: TrainState) -> Experience:
+    def batch_of(self, state: TrainState, params: EnvParams) -> Experience:
         """Shapes of the batch of an update."""
+        del params
         every, size = self.environments, self.data.unroll * self.environments.count // self.data.minibatches
         normal = jax.ShapeDtypeStruct((every.count,), state.obs.dtype)
         _, _, extras, _ = jax.eval_shape(every.explore, state, normal)

@@ -25,10 +25,8 @@ from jax.sharding import PartitionSpec as P
 
 from jaxouter.identification import counterfactual, records
 from jaxouter.identification.records import Record
-from jaxouter.loop import rewards
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw
-from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import PretrainingConfig
@@ -91,14 +89,12 @@ class DifferentiableRollout:
     def of(
         cls,
         config: PretrainingConfig,
-        plant: Plant,
+        episodes: TrainingEpisodes,
         policy: LearnedPolicy,
         batch: int,
         devices: int = 1,
-        reward: RewardConfig = rewards.PAPER,
     ) -> DifferentiableRollout:
         """The roll-out as configured, on as many of the devices as can share a batch evenly."""
-        episodes = TrainingEpisodes(plant, config.noise, config.load, reward)
         return cls(episodes, policy, batch, config.log_above, math.gcd(batch, devices))
 
     @property
@@ -221,7 +217,7 @@ def model_of(
 
 def pretrain(
     config: PretrainingConfig,
-    plant: Plant,
+    episodes: TrainingEpisodes,
     plant_params: Any,
     policy: LearnedPolicy,
     learned: LearnedParams,
@@ -230,7 +226,6 @@ def pretrain(
     begin: PretrainingState | None = None,
     devices: int = 1,
     say: Say = lambda what, done, of: None,
-    reward: RewardConfig = rewards.PAPER,
 ) -> Any:
     """Pretrain an actor on a differentiable plant, of which each episode is a draw.
 
@@ -242,25 +237,25 @@ def pretrain(
 
     Args:
         config: number of gradient steps, among others.
-        plant, plant_params: with the plant's own length of an episode.
+        episodes, plant_params: with the plant's own length of an episode.
         policy, learned: the policy and its initial parameters; the actor's first layer takes whitened observations.
         keys: two, for the whitening and for the episodes.
         report: see `Report`.
         begin: state from which to resume a pretraining with the same arguments; None: from its start.
         devices: of this process, to share the episodes of a gradient step.
         say: see `Say`.
-        reward: weights of the reward.
 
     Returns:
         The actor's parameters, for plain observations.
     """
     key_white, key_run = keys
-    base, stages = learned.base, [DifferentiableRollout.of(config, plant, policy, config.batch_size, devices, reward)]
+    base, plant = learned.base, episodes.plant
+    stages = [DifferentiableRollout.of(config, episodes, policy, config.batch_size, devices)]
     longer = config.gradient_steps  # first step with longer episodes
     if (config.episode_steps or 0) > plant.episode_steps:
         longer = int(SHORT * config.gradient_steps) // CHUNK * CHUNK
         longer_plant = replace(plant, episode_steps=config.episode_steps)
-        stages.append(replace(stages[0], episodes=replace(stages[0].episodes, plant=longer_plant)))
+        stages.append(replace(stages[0], episodes=replace(episodes, plant=longer_plant)))
     say("compiling", 0, 0)
     white = stages[0].whitening(base, plant_params, key_white)
     rates, at = cosine(config.gradient_steps), PretrainingState.begin(learned.actor) if begin is None else begin

@@ -15,6 +15,7 @@ import numpy as np
 from jaxouter.identification import counterfactual
 from jaxouter.identification.counterfactual import CounterfactualParams
 from jaxouter.loop.environment import EnvParams
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.environments import TrainState
 from jaxouter.training.off_policy import OffPolicyDriver
@@ -50,7 +51,7 @@ def resources(config: TrainConfig) -> Resources:
     observer, start = trainer.env.observer, config.pretraining
     state = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
     widths = " - ".join(map(str, (observer.size, *config.agent.hidden, 1)))
-    parts = {"agent": _size(state.agent), "data": _size(state.data)}
+    parts = {"agent": _size(state.agent), "data": _size((state.data, state.pairs))}
     parts |= {"environments": _size((state.env, state.obs, state.noise))}
     whole = _size(state)
     lines = [
@@ -74,7 +75,7 @@ def resources(config: TrainConfig) -> Resources:
     # Random numbers of an epoch are drawn before it; off-policy learners hold those for drawing batches twice.
     data, rounds = config.agent.data, config.epoch // config.environments
     drawn = 16 * rounds * getattr(data, "updates", 1) * getattr(data, "batch_size", 1)
-    memory = (here + 1) * whole + (drawn if config.epochs else 0)  # one more while it is being saved
+    memory = (here + 1) * whole + (drawn if config.agent_epochs else 0)  # one more while it is being saved
     if start.gradient_steps:
         steps = start.episode_steps or trainer.env.plant.episode_steps
         # Back-propagation keeps activations of the whole episode; XLA was seen to allocate two thirds of them.
@@ -94,8 +95,8 @@ def arithmetic(config: TrainConfig) -> tuple[float, float]:
     trainer, params = build(config)
     state = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
     update = math.nan
-    if config.epochs:
-        batch = jax.eval_shape(lambda s: trainer.driver.batch_of(s), state)
+    if config.agent_epochs:
+        batch = jax.eval_shape(trainer.driver.batch_of, state, params)
         update = _flop(trainer.agent.update, state.agent, batch, state.key)
     return _gradient_step(trainer, params, state) if config.pretraining.gradient_steps else math.nan, update
 
@@ -121,7 +122,7 @@ def _gradient_step(trainer: Trainer, params: EnvParams, state: TrainState) -> fl
         shapes = (lags,), (lags,), (steps,), (steps + 1,), (steps + 1,)
         leaves: Any = [jax.ShapeDtypeStruct((1, *shape), state.obs.dtype) for shape in shapes]
         model = CounterfactualParams(*leaves)
-    one_step = replace(plant, episode_steps=1)
+    one_step = TrainingEpisodes(replace(plant, episode_steps=1), trainer.config.disturbances)
     rollout = DifferentiableRollout.of(start, one_step, trainer.policy, 1)
     learned = trainer.policy_params(state)
 

@@ -149,7 +149,7 @@ class RunFolder:
     @property
     def drawn(self) -> tuple[str, Ranges, float]:
         """The plant of the training, ranges of its parameters, and the largest standard deviation of sensor noise."""
-        noise = self.config.pretraining.noise * self.trainer[0].env.observer.y_scale
+        noise = self.config.disturbances.noise * self.trainer[0].env.observer.y_scale
         return self.config.plant, self.config.randomise, noise
 
     @cached_property

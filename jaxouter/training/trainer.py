@@ -17,18 +17,21 @@ import numpy as np
 
 from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
+from jaxouter.agents.pairs import PairsLearner
 from jaxouter.agents.replay import Replay
 from jaxouter.identification import lq, steady_state
 from jaxouter.identification.records import Record, within
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw, none, padded
 from jaxouter.loop.references import SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
 from jaxouter.training.environments import AXIS, Environments, TrainState
-from jaxouter.training.off_policy import FIELDS, OffPolicyDriver
+from jaxouter.training.improvement import Improvement
+from jaxouter.training.off_policy import FIELDS, OffPolicyDriver, Windows
 from jaxouter.training.on_policy import OnPolicyDriver
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 from jaxouter.training.pretraining import PretrainingState, Say, model_of, pretrain, recorded
@@ -36,6 +39,9 @@ from jaxouter.training.pretraining import PretrainingState, Say, model_of, pretr
 PRETRAINING = 1  # folded into a key
 DIAGNOSIS = 2  # likewise
 BASE = 3  # likewise
+PAIRS = 4  # likewise
+CHECK = 5  # likewise
+ON_HOST = 4  # episodes of the check on a plant that is simulated elsewhere, and may be slow
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class Trainer:
     config: TrainConfig
     environments: Environments
     driver: OffPolicyDriver | OnPolicyDriver
+    improvement: Improvement
 
     @property
     def env(self) -> Environment:
@@ -64,10 +71,6 @@ class Trainer:
     def policy_params(self, state: TrainState) -> LearnedParams:
         """The current parameters of the policy."""
         return self.environments.policy_params(state)
-
-    def updates(self, state: TrainState) -> int:
-        """Updates so far."""
-        return self.agent.data.total_updates(int(state.steps), self.environments.total)
 
     def start(
         self,
@@ -108,9 +111,10 @@ class Trainer:
         def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
             report(at, lambda: with_actor(actor()))
 
-        model = model_of(start, plant, params.plant, data, self.env.observer.history)
-        learned, reward = self.policy_params(state), self.config.reward
-        return with_actor(pretrain(start, *model, self.policy, learned, keys, reported, begin, devices, say, reward))
+        model, of_model = model_of(start, plant, params.plant, data, self.env.observer.history)
+        episodes = TrainingEpisodes(model, self.config.disturbances, self.config.reward)
+        learned, more = self.policy_params(state), (reported, begin, devices, say)
+        return with_actor(pretrain(start, episodes, of_model, self.policy, learned, keys, *more))
 
     def _base(
         self, middle: LinearLaw, params: EnvParams, data: Sequence[Record], key: chex.PRNGKey, say: Say
@@ -125,10 +129,9 @@ class Trainer:
         law = steady_state.static(plant, params.plant, key)[1]
         if kind == "static":
             return law
-        start = self.config.pretraining
         data = [within(each, plant.divergence_bounds) for each in data]
         key_choose = jax.random.fold_in(key, BASE)
-        found = lq.choose(plant, data, law, key_choose, self.env.observer.history, start.noise, start.load)
+        found = lq.choose(plant, data, law, key_choose, self.env.observer.history, self.config.disturbances)
         lq.warn_short(plant, found.most)
         return padded(found.law if found.mae < found.static_mae else law, lags)
 
@@ -138,7 +141,11 @@ class Trainer:
 
     def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         """Random networks, reset environments, no data; a zero action is the middle of the range of r~."""
-        return self.driver.fresh(key, params)
+        state = self.driver.fresh(key, params)
+        if not self.config.pairs.rounds:
+            return state
+        key_pairs, actor = jax.random.fold_in(state.key, PAIRS), self.agent.actor(state.agent)
+        return state._replace(pairs=self.improvement.init(key_pairs, actor))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
@@ -149,6 +156,21 @@ class Trainer:
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Explore and learn for `steps` environment steps; see the driver."""
         return self.driver.epoch(state, params, steps)
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def improve(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        """A round of pairs; see `Improvement`."""
+        key = jax.random.fold_in(jax.random.fold_in(state.key, PAIRS), state.pairs.rounds)
+        before = self.agent.actor(state.agent)
+        pairs, actor, metrics = self.improvement.round(state.pairs, before, state.base, params, key)
+        return state._replace(agent=self.agent.with_actor(state.agent, actor), pairs=pairs), metrics
+
+    @partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def check(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        """The state with an actor that is no worse than the base law alone; see `Improvement`."""
+        key, before = jax.random.fold_in(state.key, CHECK), self.agent.actor(state.agent)
+        actor, metrics = self.improvement.check(before, state.base, params, key)
+        return state._replace(agent=self.agent.with_actor(state.agent, actor)), metrics
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:
@@ -163,13 +185,15 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         ValueError: the configuration is inconsistent.
     """
     plant, _ = make_plant(config.check().plant)
+    least, greatest = config.redraws
     env, params = environment.make(
         config.plant,
         history=config.history,
         integral_steps=config.integral_steps,
-        goal=SetPoint(*plant.setpoint_range, config.redraw),
+        goal=SetPoint(*plant.setpoint_range, (least / plant.episode_steps, greatest / plant.episode_steps)),
         drawn=config.randomise,
         reward=config.reward,
+        disturbances=config.disturbances,
     )
     start = config.pretraining
     lags, most = start.lags or env.observer.history, (start.episode_steps or plant.episode_steps) // 2
@@ -181,7 +205,7 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         env = replace(env, observer=replace(env.observer, lags=of_base))
     # The functions are the same for all seeds, so they are compiled once.
     config = replace(config, seed=0, seeds=1, devices=1)
-    agent = config.agent.build(env.observer.size, config.total_updates, AXIS if shards > 1 else None)
+    agent = config.agent.build(env.observer.size, config.agent_updates, AXIS if shards > 1 else None)
     environments = Environments(
         env,
         LearnedPolicy(env.observer, config.agent.hidden, config.correction * float(np.ptp(plant.r_tilde_bounds)) / 2),
@@ -191,7 +215,10 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         reward_scale=config.reward_scale / plant.error_scale,
         shards=shards,
     )
-    return Trainer(config, environments, driver(config, environments)), params
+    learner = PairsLearner(config.pairs, config.agent.hidden, env.observer.size)
+    compared = config.compared if plant.differentiable else min(config.compared, ON_HOST)
+    improvement = Improvement(env, environments.policy, agent, learner, environments.reward_scale, compared)
+    return Trainer(config, environments, driver(config, environments), improvement), params
 
 
 def driver(config: TrainConfig, environments: Environments) -> OffPolicyDriver | OnPolicyDriver:
@@ -205,4 +232,5 @@ def driver(config: TrainConfig, environments: Environments) -> OffPolicyDriver |
     per_environment = max(least, min(data.replay, config.steps) // config.environments)
     replay = Replay(FIELDS, environments.count, per_environment, history, data.n_step)
     of_shard = replace(data, batch_size=data.batch_size // environments.shards)
-    return OffPolicyDriver(environments, cast(OffPolicyAgent, agent), of_shard, replay)
+    windows = Windows(replay, of_shard, environments.policy, environments.env.plant, environments.reward_scale)
+    return OffPolicyDriver(environments, cast(OffPolicyAgent, agent), windows)

@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxouter.agents.networks import Actor, Critic
+from jaxouter.agents.networks import Actor, AdvantageCritic, Critic, QuadraticCritic
 
 
 def test_layers_are_those_of_the_paper():
@@ -42,3 +42,14 @@ def test_layer_norm_makes_the_critic_independent_of_the_scale_of_its_first_layer
     scaled = jax.tree.map(jnp.copy, params)
     scaled["params"]["Dense_0"] = jax.tree.map(lambda leaf: 10.0 * leaf, scaled["params"]["Dense_0"])
     chex.assert_trees_all_close(critic.apply(params, obs, action), critic.apply(scaled, obs, action), atol=1e-5)
+
+
+def test_quadratic_critics_are_concave_in_the_action_and_gain_nothing_without_a_change():
+    obs, actions = jnp.array([1.0, -2.0, 0.5]), jnp.linspace(-1.0, 1.0, 21)
+    for critic, of in ((QuadraticCritic((8, 8)), lambda a: a[None]), (AdvantageCritic((8, 8)), lambda a: a)):
+        params = critic.init(jax.random.key(0), obs, of(actions[0]))
+        values = np.array([critic.apply(params, obs, of(a)) for a in actions])
+        curvature = np.diff(values, 2)
+        assert (curvature < 0.0).all()
+        np.testing.assert_allclose(curvature, curvature[0], rtol=1e-2)
+    assert critic.apply(params, obs, jnp.zeros(())) == 0.0

@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from jaxouter.identification import lq, steady_state
 from jaxouter.identification.records import Record, record
 from jaxouter.identification.steady_state import IdentificationWarning
+from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import Linear, LinearLaw, affine, padded
 from tests import kinds, lag
@@ -130,11 +131,11 @@ def chosen(make, episodes=16, **changes):
     plant, params = make(**changes)
     _, static = steady_state.static(plant, params, KEY)
     data = record(plant, params, jax.random.key(1), episodes)
-    return plant, params, static, lq.choose(plant, [data], static, jax.random.key(2), 15, 0.015, 0.1)
+    return plant, params, static, lq.choose(plant, [data], static, jax.random.key(2), 15, Disturbances(0.015, 0.1))
 
 
 def mean_error(plant, params, law) -> float:
-    episodes, policy = TrainingEpisodes(plant, 0.015, 0.1), Linear(plant.r_tilde_bounds)
+    episodes, policy = TrainingEpisodes(plant, Disturbances(0.015, 0.1)), Linear(plant.r_tilde_bounds)
 
     @jax.jit
     @jax.vmap
@@ -174,6 +175,6 @@ def test_a_short_record_gets_fewer_lags_and_it_is_said():
 def test_where_nothing_is_finite_it_is_the_static_prefilter():
     plant, _ = lag.make()
     data = Record(np.zeros((4, 50)), np.full((4, 51), np.nan))
-    found = lq.choose(plant, [data], affine(2.0, 0.0), KEY, 15, 0.015, 0.1)
+    found = lq.choose(plant, [data], affine(2.0, 0.0), KEY, 15, Disturbances(0.015, 0.1))
     assert found.settings is None
     assert float(found.law.r) == 2.0

@@ -15,6 +15,7 @@ import pytest
 import jaxouter
 from jaxouter import plants
 from jaxouter.loop import rewards, sensor
+from jaxouter.loop.disturbances import Disturbances, Load
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Signals
 from jaxouter.loop.references import Reaimed, SetPoint
@@ -97,6 +98,31 @@ def test_plants_of_the_paper_keep_shapes_and_precision(name: str) -> None:
     obs, state, reward, *_ = jax.eval_shape(env.step, KEY, before[1], scalar(1.0), params)
     chex.assert_trees_all_equal_shapes_and_dtypes(before, (obs, state))
     assert (obs.dtype, reward.dtype) == (FLOAT, FLOAT)
+
+
+def test_half_of_the_episodes_have_noise_and_half_a_load_where_asked() -> None:
+    env, params = make(disturbances=Disturbances(0.5, 0.2))
+    found = jax.vmap(lambda key: env.reset(key, params)[1])(jax.random.split(KEY, 400))
+    for value, most in ((found.disturbance.noise, 0.5), (found.disturbance.load.size, 0.2 * 4.0)):
+        assert np.mean(np.asarray(value) == 0.0) == pytest.approx(0.5, abs=0.08)
+        assert 0.9 * most < np.abs(value).max() <= most
+    assert make()[0].reset(KEY, params)[1].disturbance is None
+    noisy = np.asarray(found.disturbance.noise) > 0.0
+    np.testing.assert_array_equal(noisy, np.asarray(found.y != found.y_seen))
+
+
+def test_a_load_is_added_to_the_modified_reference_unseen() -> None:
+    env, params = make(disturbances=Disturbances(0.0, 0.2))
+    _, state = env.reset(KEY, params)
+    load = Load(scalar(3.0), scalar(0.25))
+    state = state._replace(disturbance=state.disturbance._replace(load=load))
+    plain, other = make()[0], state._replace(disturbance=None)
+    for k in range(30):
+        state = step_env(env, KEY, state, scalar(0.5), params)[1]
+        other = step_env(plain, KEY, other, scalar(0.5 if k < 3 else 0.75), params)[1]
+        np.testing.assert_allclose(state.y, other.y, rtol=1e-6)
+    assert float(state.memory.r_tilde_past[0]) == 0.5
+    assert float(other.memory.r_tilde_past[0]) == 0.75
 
 
 @pytest.mark.parametrize("shape", [(2,), (1, 1)])

@@ -156,6 +156,26 @@ def test_observations_before_and_after_some_steps_are_those_seen(recorded: Recor
     assert compared > 4
 
 
+@pytest.mark.parametrize("steps", [1, 3])
+def test_observations_of_a_held_reference_are_those_seen_under_it(recorded: Recorded, steps: int) -> None:
+    held = jax.jit(OBSERVER.held, static_argnums=1)
+    compared = 0
+    for i in range(H, len(recorded.obs) - steps + 1):
+        j = i + steps - 1
+        if recorded.episode[i] == recorded.episode[j]:
+            window, r = recorded.cut(i - H, j), scalar(13.0)
+            y = jnp.append(window.y[H:], window.y_next[-1])
+            memory, tau = recorded.memories[i], OBSERVER.integral_steps
+            before = (memory.integral - (window.r[H] - y[0]) / tau) / (1.0 - 1.0 / tau)
+            memory, first = OBSERVER.observe(memory._replace(integral=before), r, y[0])
+            for k in range(steps):
+                memory, last = OBSERVER.observe(OBSERVER.record(memory, y[k], window.r_tilde[H + k]), r, y[k + 1])
+            found = OBSERVER.before_and_after(held(window, H, r), H, H + steps - 1)
+            chex.assert_trees_all_close(found, (first, last), atol=1e-5)
+            compared += 1
+    assert compared > 4
+
+
 def test_nothing_but_references_and_outputs_is_recorded() -> None:
     assert Signals._fields == ("r", "y", "integral", "r_tilde", "age", "r_next", "y_next")
     assert Memory._fields == ("y_past", "r_tilde_past", "integral")
@@ -170,6 +190,7 @@ def test_nothing_but_references_and_outputs_is_recorded() -> None:
         (Observer.features, ["self", "memory", "r", "y"]),
         (Observer.memory_at, ["self", "window", "i"]),
         (Observer.before_and_after, ["self", "window", "i", "j"]),
+        (Observer.held, ["self", "window", "i", "r"]),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -160,20 +160,20 @@ def test_set_points_of_different_keys_fill_the_range() -> None:
 
 
 def test_set_point_redrawn_with_certainty_changes_at_each_step() -> None:
-    r = follow(SetPoint(LOW, HIGH, redraw=1.0), np.zeros(100))
+    r = follow(SetPoint(LOW, HIGH, redraw=(1.0, 1.0)), np.zeros(100))
     assert len(np.unique(r)) == 100
     assert LOW <= r.min() < r.max() <= HIGH
 
 
 def test_set_point_is_redrawn_as_often_as_asked() -> None:
     n, p = 2000, 0.1
-    r = follow(SetPoint(LOW, HIGH, redraw=p), np.zeros(n + 1))
+    r = follow(SetPoint(LOW, HIGH, redraw=(p, p)), np.zeros(n + 1))
     changes = np.count_nonzero(np.diff(r))
     assert abs(changes - n * p) < 5 * np.sqrt(n * p * (1 - p))
 
 
 def test_set_point_does_not_depend_on_the_output() -> None:
-    goal = SetPoint(LOW, HIGH, redraw=0.1)
+    goal = SetPoint(LOW, HIGH, redraw=(0.1, 0.1))
     np.testing.assert_array_equal(follow(goal, np.zeros(2001)), follow(goal, np.linspace(-9.0, 9.0, 2001)))
 
 

@@ -24,17 +24,18 @@ def test_paper_preset_is_the_papers(plant, steps):
     config = preset(plant, "paper")
     agent = config.agent
     assert (config.steps, config.environments, agent.updates, agent.replay) == (steps, 1, 1, 1_000_000)
-    assert (agent.noise_theta, agent.noise_sigma, config.base, config.redraw) == (0.15, (0.2, 0.2), "absolute", 0.0)
+    assert (agent.noise_theta, agent.noise_sigma) == (0.15, (0.2, 0.2))
+    assert (config.base, config.redraws) == ("absolute", (0.0, 0.0))
     assert config.total_updates == steps - agent.prefill
 
 
 def test_numbers_of_numpy_are_numbers():
-    start = PretrainingConfig(gradient_steps=np.int32(3), noise=np.float32(0.1))
+    start = PretrainingConfig(gradient_steps=np.int32(3), log_above=np.float32(0.1))
     asked = dict(seeds=np.int64(2), randomise=[["d1", np.float64(0), 1]])
     config = with_agent(preset("pitch"), noise_sigma=[np.float32(0.1), jnp.asarray(0.2)])
     config = replace(config, pretraining=start, **asked).check()
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
-    assert (config.seeds, config.agent.noise_sigma, config.pretraining.noise) == (2, (0.1, 0.2), 0.1)
+    assert (config.seeds, config.agent.noise_sigma, config.pretraining.log_above) == (2, (0.1, 0.2), 0.1)
     with pytest.raises(ValueError, match="reward_scale is nan"):
         replace(preset("pitch"), reward_scale=np.float32("nan")).check()
 
@@ -56,37 +57,44 @@ def test_numbers_of_numpy_are_numbers():
             {"steps": 8_000},
             "agent.prefill is 8000; it must be at least the batch size, 256 and less than the 8000 steps",
         ),
-        ({"pretraining": PretrainingConfig()}, "steps is 0; it must be positive, or 0 with pretraining"),
+        ({"pretraining": PretrainingConfig()}, "steps is 0; it must be positive, or 0 with pretraining or rounds"),
         ({"pretraining": PretrainingConfig(1, plants=2)}, "pretraining.plants is 2; without randomise it must be 1"),
         (
             {"pretraining": PretrainingConfig(1, plants=3), "randomise": (("gain", 0.8, 1.2),)},
             "pretraining.episodes is 64; it must be a multiple of the 3 plants",
         ),
-        ({"redraw": 1.5}, "redraw is 1.5"),
+        ({"redraws": (2.0, 1.0)}, r"redraws is \(2.0, 1.0\)"),
+        ({"compared": 0, "pairs.rounds": 2}, "compared is 0; it must be positive"),
+        ({"agent.relabel": 0.5, "agent.hold": False}, "agent.relabel is 0.5 and agent.hold is False"),
+        ({"agent.layer_norm": True}, "agent.critic is 'quadratic' and agent.layer_norm is True"),
+        ({"disturbances.load": -0.1}, "disturbances.load is -0.1; it must not be negative"),
         ({"agent.noise_sigma": (0.0, 0.1)}, r"agent.noise_sigma is \(0.0, 0.1\)"),
-        ({"agent.speed": 1}, "there is no option 'agent.speed'; there are: agent.hidden, agent.layer_norm,"),
+        ({"agent.speed": 1}, "there is no option 'agent.speed'; there are: agent.hidden, agent.critic,"),
         ({"speed": 1}, "there is no option 'speed'; there are: agent, seed,"),
         ({"agent": "ddpg"}, "agent is 'ddpg'; it has settings of its own, such as agent.hidden"),
     ],
 )
 def test_errors_name_field_value_and_what_is_allowed(change, text):
     with pytest.raises(ValueError, match=text):
-        with_options(preset("pitch"), change).check()
+        with_options(preset("pitch", "record"), change).check()
 
 
 def test_unknown_preset_lists_those_that_exist():
-    with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, robust, paper"):
+    with pytest.raises(
+        ValueError, match="no preset 'fast' for heaters; the presets are: default, scratch, record,"
+    ):
         preset("heaters", "fast")
 
 
 def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
     monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
-    for name in ("default", "paper"):
-        wanted = replace(preset("pitch", name), plant="lag")
-        if name == "default":
-            wanted = replace(wanted, correction=1.0, reward=replace(wanted.reward, beta_h=0.1))
+    for name, correction in (("default", 0.2), ("scratch", 1.0), ("record", 1.0), ("paper", 1.0)):
+        wanted = replace(preset("pitch", name), plant="lag", correction=correction)
+        wanted = replace(wanted, reward=replace(wanted.reward, beta_h=0.1))
         assert preset("lag", name).check() == wanted
-    with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, paper"):
+    with pytest.raises(
+        ValueError, match="no preset 'robust' for lag; the presets are: default, scratch, record,"
+    ):
         preset("lag", "robust")
 
 
@@ -102,4 +110,5 @@ def test_ranges_survive_json():
 
 def test_last_epoch_may_be_shorter():
     config = replace(preset("pitch"), steps=8_000 + 6_400 + 160, epoch=6_400)
-    assert config.epochs == 2
+    assert config.agent_epochs == 2
+    assert [config.steps_of(epoch, 200) for epoch in range(2)] == [(6_400, 1_600), (160, 40)]

@@ -10,6 +10,7 @@ import pytest
 from jaxouter import plants
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.identification import counterfactual, records, steady_state
+from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
@@ -126,7 +127,7 @@ def test_costs_count_by_their_logarithm_where_asked(config):
 
 def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
     trainer, _ = build(config)
-    episodes = TrainingEpisodes(trainer.env.plant, noise=0.5, load=0.5)
+    episodes = TrainingEpisodes(trainer.env.plant, Disturbances(0.5, 0.5))
     keys = jax.random.split(jax.random.key(0), 400)
     noise = np.asarray(jax.vmap(lambda key: episodes.noises(key, 50))(keys))
     level = noise.std(1)

@@ -6,8 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxouter.loop.disturbances import Disturbances
+from jaxouter.loop.rewards import RewardConfig
 from jaxouter.training.devices import Fleet
 from jaxouter.training.environments import EPISODES
+from jaxouter.training.improvement import Still
 from jaxouter.training.off_policy import FIELDS
 from jaxouter.training.trainer import DIAGNOSIS, build
 from tests.precision import X64, makes_nan
@@ -63,7 +66,7 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
     gamma = trainer.config.agent.discount
 
     bits = jax.random.bits(jax.random.key(0), (trainer.config.agent.batch_size, 2), jnp.uint32)
-    batch = trainer.driver.batch(state.data, bits)
+    batch = trainer.driver.batch(state, params, bits)
     rows, _ = trainer.driver.replay.sample(state.data, bits)
     for i, row in enumerate(np.asarray(rows)):
         match = np.argwhere(
@@ -78,6 +81,65 @@ def test_batches_hold_the_observations_that_the_environment_gave(n_step):
         np.testing.assert_allclose(batch.next_obs[i], final[t + k, e], atol=1e-5)
         np.testing.assert_allclose(batch.reward[i], total * trainer.config.reward_scale, rtol=1e-4)
         assert float(batch.discount[i]) == pytest.approx(0.0 if terminated[t + k, e] else gamma ** (k + 1))
+
+
+@pytest.mark.parametrize("relabel", [0.0, 1.0])
+def test_held_transitions_are_what_the_environment_gives_where_r_stays(relabel):
+    """With a noisy sensor, limits, a price at rest and set-points that are often redrawn."""
+    config = small(
+        hold=True, relabel=relabel, n_step=4, redraws=(30.0, 60.0), disturbances=Disturbances(0.5, 0.3),
+        reward=RewardConfig(huber=0.01, rest=0.1, rest_after=2), base="static", epoch=800, steps=1_600, replay=960,
+    )  # fmt: skip
+    trainer, params = build(config)
+    state, lead = trainer.start(0, params), trainer.driver.replay.lead
+    step, write = jax.jit(trainer.environments.step), jax.jit(trainer.driver.replay.write)
+    still = replace(trainer.env, goal=Still())
+
+    @jax.jit
+    def held(env, r, r_tilde, keys):
+        """Rewards and the observation after each of the steps, the set-point r in all."""
+        memory = env.memory._replace(integral=env.memory.integral + (r - env.r) / trainer.env.observer.integral_steps)
+        env = env._replace(goal=r, r=r, memory=memory)
+
+        def one(env, xs):
+            obs, env, reward, *_ = still.step_env(xs[1], env, xs[0], params)
+            return env, (obs, reward)
+
+        return trainer.env.observer.features(memory, r, env.y_seen), jax.lax.scan(one, env, (r_tilde, keys))[1]
+
+    envs, taken_keys, r_tildes = [], [], []
+    for t in range(100):
+        key = jax.random.key(t)
+        keys, action = jax.random.split(key, 8), jax.random.uniform(key, (8,), minval=-0.3, maxval=0.3)
+        envs.append(state.env)
+        state, taken = step(state, params, action, keys)
+        taken_keys.append(keys)
+        r_tildes.append(taken.signals.r_tilde)
+        state = state._replace(data=write(state.data, trainer.driver.row(taken)))
+    r_tildes, span = np.asarray(jnp.stack(r_tildes)), np.ptp(trainer.env.plant.setpoint_range)
+    bits = jax.random.bits(jax.random.key(0), (64, trainer.driver.data.bits), jnp.uint32)
+    batch = trainer.driver.batch(state, params, bits)
+    rows, _ = trainer.driver.replay.sample(state.data, bits)
+    cut = 0
+    for i, row in enumerate(np.asarray(rows)):
+        t, e = np.argwhere(np.float32(r_tildes) == row[lead, FIELDS.index("r_tilde")])[0]
+        r = batch.obs[i, 0] * trainer.env.observer.y_scale + trainer.env.observer.y_middle
+        assert relabel or float(r) == pytest.approx(float(envs[t].r[e]), rel=1e-5)
+        n = 1
+        while n < 4 and abs(float(envs[t + n].r[e]) - float(r)) <= 0.02 * span and int(envs[t + n].k[e]) > 0:
+            n += 1
+        cut += n < 4
+        env = jax.tree.map(lambda leaf, e=e: leaf[e], envs[t])
+        steps = [jnp.stack([each[min(t + k, 99)][e] for k in range(4)]) for each in (jnp.asarray(r_tildes), taken_keys)]
+        obs, (after, reward) = held(env, r, *steps)
+        np.testing.assert_allclose(batch.obs[i], obs, atol=1e-4)
+        np.testing.assert_allclose(batch.next_obs[i], after[n - 1], atol=1e-4)
+        total = np.asarray(reward)[:n] @ config.agent.discount ** np.arange(n) * trainer.environments.reward_scale
+        np.testing.assert_allclose(batch.reward[i], total, rtol=1e-3, atol=1e-4)
+        assert float(batch.discount[i]) == pytest.approx(config.agent.discount**n)
+        applied = trainer.policy.r_tilde(state.base, env.memory, r, env.y_seen, batch.action[i, 0])
+        np.testing.assert_allclose(applied, r_tildes[t, e], atol=1e-3)
+    assert cut > 10
 
 
 def test_scan_equals_a_python_loop(filled):
@@ -223,8 +285,8 @@ def test_base_law_is_the_static_prefilter():
 
 
 def test_set_points_are_redrawn_within_an_episode_only_where_asked():
-    for redraw, changes in ((0.0, False), (0.5, True)):
-        trainer, params = build(replace(SMALL, redraw=redraw))
+    for redraws, changes in (((0.0, 0.0), False), ((20.0, 100.0), True)):
+        trainer, params = build(replace(SMALL, redraws=redraws))
         rows = trainer.prefill(trainer.start(0, params), params).data.rows[:, trainer.driver.replay.mirror :][:, :80]
         r, age = rows[..., FIELDS.index("r")], rows[..., FIELDS.index("age")]
         within = (age[:, 1:] > 0) & (r[:, 1:] != r[:, :-1])

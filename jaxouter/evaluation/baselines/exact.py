@@ -6,6 +6,7 @@ on the plant itself, by the MAE. In operation they see r and y alone, without pr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import chex
@@ -31,8 +32,8 @@ def law(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[Choice, int]:
     history, _ = dynamics.suitable_history(plant, params, key_explore)
     _, static = steady_state.static(plant, params, key_static)
     clean = within(record(plant, plant.noise_free(params), key_record, RECORD), plant.divergence_bounds)
-    load = learner(plant).pretraining.load
-    return choose(plant, [clean], static, key_choose, history, 0.0, load, on=params), history
+    loads = replace(learner(plant).disturbances, noise=0.0)
+    return choose(plant, [clean], static, key_choose, history, loads, on=params), history
 
 
 def tune_lq(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:

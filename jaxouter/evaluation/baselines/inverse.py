@@ -123,7 +123,7 @@ def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Repo
 
 def _noise(plant: Plant, data: Record, key: chex.PRNGKey) -> np.ndarray:
     """The measurement noise of the learner's episodes, for a record."""
-    episodes = TrainingEpisodes(plant, learner(plant).pretraining.noise)
+    episodes = TrainingEpisodes(plant, learner(plant).disturbances)
     keys, steps = jax.random.split(key, len(data.y)), data.y.shape[1]
     return np.asarray(jax.vmap(lambda key: episodes.noises(key, steps))(keys), np.float64)
 

@@ -23,15 +23,14 @@ RECORD = 64  # episodes
 
 
 def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    """The best law of a record, under the noise and loads of the learner's pretraining."""
+    """The best law of a record, under the noise and loads of the learner."""
     del budget
     key_explore, key_static, key_record, key_choose = jax.random.split(key, 4)
     history, explored = dynamics.suitable_history(plant, params, key_explore)
     _, static = steady_state.static(plant, params, key_static)
     data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("choosing its law", 0.5)
-    start = learner(plant).pretraining
-    found = choose(plant, [data], static, key_choose, history, start.noise, start.load, figure)
+    found = choose(plant, [data], static, key_choose, history, learner(plant).disturbances, figure)
     return kept(found, explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size)
 
 

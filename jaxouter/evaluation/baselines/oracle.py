@@ -24,6 +24,7 @@ from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned, cached
 from jaxouter.identification import counterfactual
 from jaxouter.identification.steady_state import LEVELS, static
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw, padded
 from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant, make
@@ -63,7 +64,8 @@ def differentiable(config: TrainConfig) -> tuple[DifferentiableRollout, Any]:
     """The roll-out with actor and disturbances of a configuration, and the parameters of its plant."""
     trainer, env = build_trainer(config)
     plant = replace(trainer.env.plant, reward_terms=())  # the limit is of what is reported
-    return DifferentiableRollout.of(config.pretraining, plant, trainer.policy, BATCH, reward=ERROR), env.plant
+    episodes = TrainingEpisodes(plant, config.disturbances, ERROR)
+    return DifferentiableRollout.of(config.pretraining, episodes, trainer.policy, BATCH), env.plant
 
 
 def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
@@ -90,7 +92,8 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
         def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
             report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
 
-        actor = pretrain(start, plant, of_plant, trainer.policy, learned, keys, heard, reward=ERROR)
+        episodes = TrainingEpisodes(plant, config.disturbances, ERROR)
+        actor = pretrain(start, episodes, of_plant, trainer.policy, learned, keys, heard)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
         return kept(actor, learned.base, {"gradient_steps": start.gradient_steps}, steps)
 

@@ -15,6 +15,7 @@ from jaxouter.evaluation.metrics import trained_return
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.loop import sensor
+from jaxouter.loop.disturbances import UNDISTURBED, Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import Policy
 from jaxouter.loop.references import redrawn
@@ -33,17 +34,21 @@ def learner(plant: Plant) -> TrainConfig:
 
 
 def training_episodes(
-    plant: Plant, params: Any, key: chex.PRNGKey, episodes: int = EPISODES, noise: float = 0.0, load: float = 0.0
+    plant: Plant,
+    params: Any,
+    key: chex.PRNGKey,
+    episodes: int = EPISODES,
+    disturbances: Disturbances = UNDISTURBED,
 ) -> Scenario:
     """Episodes of the training distribution as a scenario: starts of training, set-points of the plant's range.
 
     Args:
         plant, params, key: of the episodes.
         episodes: how many.
-        noise, load: see `TrainingEpisodes`.
+        disturbances: of each.
     """
     key_r, key_draw, key_run = jax.random.split(key, 3)
-    disturbed = TrainingEpisodes(plant, noise, load)
+    disturbed = TrainingEpisodes(plant, disturbances)
     key_level, *keys_load = jax.random.split(jax.random.fold_in(key, DISTURBED), 1 + episodes)
     levels = jax.vmap(disturbed.level)(jax.random.split(key_level, episodes))
     loads = jax.vmap(lambda key: disturbed.loads(key, plant.episode_steps))(jnp.stack(keys_load))
@@ -57,15 +62,14 @@ def training_episodes(
         params=jax.vmap(draw, (0, None), axis_size=episodes)(jax.random.split(key_draw, episodes), params),
         r=r,
         keys=jax.random.split(key_run, episodes),
-        sensor=replace(sensor.params(), noise=levels) if noise else sensor.params(),
-        load=loads if load else None,
+        sensor=replace(sensor.params(), noise=levels) if disturbances.noise else sensor.params(),
+        load=loads if disturbances.load else None,
     )
 
 
 def learners_episodes(plant: Plant, params: Any, key: chex.PRNGKey) -> Scenario:
-    """Training episodes with the noise and the loads of the learner's pretraining."""
-    start = learner(plant).pretraining
-    return training_episodes(plant, params, key, noise=start.noise, load=start.load)
+    """Training episodes with the noise and the loads of the learner."""
+    return training_episodes(plant, params, key, disturbances=learner(plant).disturbances)
 
 
 def score(policy: Policy, params: Any, episodes: Scenario) -> float:

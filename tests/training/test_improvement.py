@@ -1,0 +1,105 @@
+"""Rounds of improvement by pairs, and the gate."""
+
+from dataclasses import replace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxouter.agents.pairs import PairsConfig
+from jaxouter.loop.disturbances import Disturbances
+from jaxouter.training.gate import compare, judge
+from jaxouter.training.trainer import build
+from tests.training.small import small
+
+PAIRS = PairsConfig(rounds=3, states=1024, environments=16, horizon=20, change=0.1, updates=100, batch_size=128)
+LEARNING = dict(steps=0, pairs=PAIRS, compared=128, disturbances=Disturbances(0.02, 0.2), redraws=(1.0, 20.0))
+CONFIG = small(base="static", correction=0.5, **LEARNING)
+KEY = jax.random.key(5)
+
+
+@pytest.fixture(scope="module")
+def started():
+    trainer, params = build(CONFIG)
+    return trainer, params, trainer.start(0, params)
+
+
+def improved(trainer, params, state):
+    rows = []
+    for _ in range(PAIRS.rounds):
+        state, metrics = trainer.improve(jax.tree.map(jnp.copy, state), params)
+        rows.append({name: float(value) for name, value in metrics.items()})
+    return state, rows
+
+
+def gained(trainer, params, base, before, after, episodes=256):
+    one = jax.tree.map(lambda leaf: leaf[None], after)
+    found = jax.jit(compare, static_argnums=(0, 1, 7))(
+        trainer.env, trainer.policy, before, one, base, params, KEY, episodes
+    )
+    return {name: float(value[0]) for name, value in found._asdict().items()}
+
+
+def test_rounds_make_a_static_prefilter_better_and_report_it(started):
+    trainer, params, state = started
+    after, rows = improved(trainer, params, state)
+    assert rows[0]["kept"] > 0.0
+    assert all(0.0 <= row["kept"] <= 1.0 for row in rows)
+    assert all((row["kept"] > 0.0) == (row["gain"] > 0.0 and row["worst"] > -1.0) for row in rows)
+    found = gained(trainer, params, state.base, state.agent.actor, after.agent.actor)
+    assert found["gain"] > 5 * found["error"]
+    again, _ = improved(trainer, params, state)
+    chex.assert_trees_all_equal(again, after)
+
+
+def test_steps_and_updates_count_those_of_pairs():
+    length = build(CONFIG)[0].env.plant.episode_steps
+    steps = 16 * length + 2 * 1024 * 20 + 4 * 128 * length
+    assert [CONFIG.done_by(epoch, length) for epoch in range(3)] == [(0, 0), (steps, 200), (2 * steps, 400)]
+    assert CONFIG.environment_steps == 3 * steps + 2 * 128 * length + CONFIG.identification_steps
+    assert CONFIG.total_updates == 600
+
+
+def test_the_gain_of_no_change_is_nothing_and_pairs_are_paired(started):
+    trainer, params, state = started
+    found = jax.jit(trainer.improvement.pairs)(state.agent.actor, state.base, params, KEY)
+    np.testing.assert_allclose(np.abs(found.change).max(), PAIRS.change, rtol=0.05)
+    assert np.abs(found.change).min() >= 0.2 * PAIRS.change * 0.99
+    learner = replace(trainer.improvement.learner, config=replace(PAIRS, change=1e-30))
+    still = replace(trainer.improvement, learner=learner)
+    unchanged = jax.jit(still.pairs)(state.agent.actor, state.base, params, KEY)
+    np.testing.assert_array_equal(unchanged.gain, 0.0)
+
+
+def test_in_the_end_the_base_law_remains_where_what_was_learned_is_worse(started):
+    trainer, params, state = started
+    good, _ = improved(trainer, params, state)
+    layers = good.agent.actor["params"]
+    last = max(layers)  # which is linear: the opposite corrections
+    bad = {"params": layers | {last: jax.tree.map(jnp.negative, layers[last])}}
+    for actor, kept in ((good.agent.actor, 1.0), (bad, 0.0)):
+        before = good._replace(agent=trainer.agent.with_actor(good.agent, actor))
+        after, found = trainer.check(jax.tree.map(jnp.copy, before), params)
+        assert float(found["kept"]) == kept
+        chex.assert_trees_all_equal(after.agent.actor, jax.tree.map(lambda leaf, kept=kept: kept * leaf, actor))
+
+
+def test_an_actor_is_not_better_than_itself(started):
+    trainer, params, state = started
+    found = gained(trainer, params, state.base, state.agent.actor, state.agent.actor, 64)
+    assert found == {"gain": 0.0, "error": 0.0, "worst": 0.0}
+
+
+def test_candidates_that_lose_in_the_mean_or_in_a_stratum_are_refused():
+    random = np.random.default_rng(0)
+    strata = jnp.asarray(np.arange(400) % 4)
+    noise = 0.1 * random.normal(size=400)
+    better, worse = noise + 0.1, noise - 0.1
+    rotten = np.where(strata == 3, noise - 0.1, noise + 0.2)
+    found = judge(jnp.asarray([better, worse, rotten]), strata)
+    assert found.better.tolist() == [True, False, False]
+    assert float(found.gain[2]) > float(found.gain[0])
+    assert float(found.worst[2]) == pytest.approx(-10.0, abs=2.5)  # 0.1 of an error of 0.1 / sqrt(100)
+    np.testing.assert_allclose(found.error[0], 0.1 / 20, rtol=0.1)
