@@ -35,25 +35,19 @@ from jaxouter.training.trainer import build
 
 FILE = Path(__file__).resolve().parent.parent / "tests" / "golden.json"
 ELEMENTS = 16  # of each array, evenly spaced
-AMPLIFIED = re.compile("^/(compare|export)/|-default/(learner|summary)/")
+AMPLIFIED = re.compile("^/(compare|export)/|-(default|record)/(learner|summary)/")
 """What the rounding of another machine moves without bound, through the gradient steps of a pretraining: there only its
 MAE is compared."""
 TOLERANCE = 0.05  # relative to the largest of them, on other machines: 50 steps of Adam amplify rounding
 PAPER = ["--preset", "paper", "--steps", "205", "--epoch", "5"]  # five updates
-DEFAULT = ["--pretraining.gradient-steps", "50"]
-TD3 = ["--pretraining.gradient-steps", "0", "--steps", "1040", "--agent.prefill", "640", "--epoch", "400"]
-TD3 += ["--environments", "8", "--redraws", "10", "10", "--agent.noise-end", "0.5", "--agent.n-step", "3"]
-TD3 += [
-    "--agent.critics",
-    "2",
-    "--agent.policy-delay",
-    "2",
-    "--agent.target-noise",
-    "0.2",
-    "--agent.hidden",
-    "32",
-    "32",
-]
+RECORD = ["--preset", "record", "--pretraining.gradient-steps", "50", "--compared", "0"]
+DEFAULT = ["--pretraining.gradient-steps", "5", "--pairs.rounds", "2", "--pairs.states", "512", "--pairs.updates", "25"]
+DEFAULT += ["--pairs.environments", "8", "--compared", "64"]
+TD3 = ["--preset", "record", "--pretraining.gradient-steps", "0", "--compared", "0", "--steps", "1040"]
+TD3 += ["--epoch", "400", "--agent.prefill", "640", "--environments", "8", "--redraws", "10", "10"]
+TD3 += ["--disturbances.noise", "0", "--disturbances.load", "0", "--agent.no-hold", "--agent.n-step", "3"]
+TD3 += ["--agent.critic", "mlp", "--agent.layer-norm", "--agent.critics", "2", "--agent.policy-delay", "2"]
+TD3 += ["--agent.noise-end", "0.5", "--agent.target-noise", "0.2", "--agent.hidden", "32", "32"]
 
 
 def main(write: bool = False, only: tuple[str, ...] = ()) -> None:
@@ -87,13 +81,13 @@ def results(folder: Path, only: tuple[str, ...]) -> dict[str, Any]:
     """Results by name; `only` selects some trainings."""
     found: dict[str, Any] = {}
     for plant in ("pitch", "heaters"):
-        for name, options in (("paper", PAPER), ("default", DEFAULT), ("td3", TD3)):
+        for name, options in (("paper", PAPER), ("record", RECORD), ("default", DEFAULT), ("td3", TD3)):
             path = folder / f"{plant}-{name}"
             if only and path.name not in only:
                 continue
             train.main([plant, *options, "--out", str(path)])
             found |= {f"{path.name}/{key}": value for key, value in trained(path).items()}
-    run = folder / "pitch-default"
+    run = folder / "pitch-record"
     if not run.exists():
         return found
     for kind in ("npz", "c"):

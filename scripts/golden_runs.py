@@ -35,7 +35,14 @@ NOT_KEPT = ("lock", "process")
 OFF_POLICY = dict(steps=400, environments=1, epoch=100)
 PRETRAINED = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8))
 DRAWN = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8, plants=4))
-SETTINGS: dict[str, dict[str, Any]] = {"default": PRETRAINED, "robust": DRAWN, "paper": OFF_POLICY}
+PAIRED = dict(pairs=dict(rounds=1, states=64, kept=1, environments=2, horizon=5, updates=2, batch_size=8), compared=8)
+SETTINGS: dict[str, dict[str, Any]] = {
+    "default": PAIRED | PRETRAINED,
+    "scratch": PAIRED | OFF_POLICY,
+    "record": PRETRAINED | dict(compared=8),
+    "robust": DRAWN,
+    "paper": OFF_POLICY,
+}
 AGENT = dict(hidden=(16, 16), batch_size=32, prefill=200, replay=400)
 
 

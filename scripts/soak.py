@@ -34,6 +34,7 @@ TRAINING = (  # so small that some gradient steps and epochs take no longer than
     *("--pretraining.batch-size", "16", "--environments", "8", "--epoch", "800"),
     *("--agent.prefill", "640", "--agent.replay", "40000"),
     *("--agent.hidden", "32", "32", "--agent.batch-size", "32", "--agent.updates", "8"),
+    *("--pairs.states", "512", "--pairs.environments", "8", "--pairs.updates", "50", "--compared", "64"),
 )
 
 

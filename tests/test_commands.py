@@ -21,7 +21,7 @@ from jaxouter.training.config import to_dict
 from jaxouter.training.run import RunFolder
 from tests import interrupts, lag
 from tests.precision import of_single_draws
-from tests.training.small import small
+from tests.training.small import PAIRS, small
 
 SMALL = ["--steps", "1600", "--agent.prefill", "640", "--epoch", "480", "--environments", "8", "--agent.replay", "1600"]
 SMALL += [
@@ -37,7 +37,7 @@ SMALL += [
     "--base",
     "absolute",
 ]
-SMALL += ["--pretraining.gradient-steps", "0"]
+SMALL += PAIRS
 PLACES = {"pitch/paper": "inside"} | {f"pitch/delay-{name}": "outside" for name in ("5.7", "0.57", "swapped")}
 
 
@@ -54,7 +54,7 @@ def trained(tmp_path_factory):
     drawn = ["--randomise", "gain", "0.8", "1.2"]
     done = command("train", "pitch", *SMALL, *drawn, "--seed", "3", "--seeds", "2", cwd=folder)
     assert done.returncode == 0, done.stderr
-    return done, folder / "runs" / "pitch-default-3"
+    return done, folder / "runs" / "pitch-scratch-3"
 
 
 def test_train_writes_the_run_folder(trained):
@@ -302,7 +302,7 @@ def test_third_plant_goes_through_the_whole_of_training(tmp_path, monkeypatch, c
     """Registered by one line, the lag with a delay is learned, and beats the inner loop and the static prefilter."""
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     out = tmp_path / "run"
-    train.main(["lag", "--pretraining.gradient-steps", "200", "--out", str(out)])
+    train.main(["lag", "--preset", "record", "--pretraining.gradient-steps", "200", "--out", str(out)])
     assert to_dict(RunFolder.open(out).config)["plant"] == "lag"
     results = json.loads((out / "summary.json").read_text())["results"]
     maes = {result["policy"]: result["scenarios"]["lag/steps"]["mae"] for result in results}

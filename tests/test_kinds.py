@@ -95,7 +95,17 @@ def test_every_kind_goes_through_check_train_and_compare(name, tmp_path, monkeyp
     else:
         assert f"DC gain │ none, {REST[name]}" in told
     assert f"dead time │ {30 if name == 'Late' else 0} control steps" in told
-    brief = ["--pretraining.gradient-steps", "200", "--pretraining.batch-size", "32", "--agent.hidden", "32", "32"]
+    brief = [
+        "--preset",
+        "record",
+        "--pretraining.gradient-steps",
+        "200",
+        "--pretraining.batch-size",
+        "32",
+        "--agent.hidden",
+        "32",
+        "32",
+    ]
     train.main([reference(name), "--out", "run", *brief])
     captured = capsys.readouterr()
     assert ("the static prefilter is r~ = r" in captured.err) == (name in REST)

@@ -222,7 +222,9 @@ def begun(clock, config, plant, flop=(10.0, 1.0)):
 
 
 def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
-    config = small("heaters", seeds=2, pretraining=preset("heaters").pretraining)  # 2,000 gradient steps, 300 updates
+    config = small(
+        "heaters", seeds=2, pretraining=preset("heaters", "record").pretraining
+    )  # 2,000 gradient steps, 300 updates
     of, learned = begun(clock, config, lag.LAG)
     learned.pretrained(0, Heard(2_000), lambda: {"mae": 0.51234})
     assert of.line.startswith("learning  MAE seed 0 0.5123 on lag/steps  2,000 of 4,600 gradient steps  49 %")
@@ -239,7 +241,7 @@ def test_one_bar_over_the_gradient_steps_of_all_seeds_and_phases(clock):
 
 
 def test_the_mae_is_looked_at_seldom_and_not_on_simulators(clock, monkeypatch):
-    config = preset("pitch")
+    config = preset("pitch", "record")
     of, learned = begun(clock, config, lag.LAG)
     now, looks = [0.0], []
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -373,7 +375,7 @@ def test_recording_from_a_simulator_has_a_bar_of_its_own(clock, monkeypatch):
     simulators = SimpleNamespace(speed=SimpleNamespace(steps=1_000))
     monkeypatch.setattr(host, "of", lambda plant: simulators, raising=False)
     config = replace(
-        small("lag", pretraining=preset("pitch").pretraining), base="static"
+        small("lag", pretraining=preset("pitch", "record").pretraining), base="static"
     )  # 64 + 8 episodes of 50 steps
     of, learned = begun(clock, config, lag.LAG)
     learned.begins("recording", 0, 0)

@@ -148,7 +148,7 @@ def test_relative_figures_are_the_same_in_any_unit(tmp_path, monkeypatch, capsys
     found = {}
     for name, unit in (("Ones", 1.0), ("Millionths", 1e-6), ("Powers", 2.0**17)):
         plant = f"units.py:{name}"
-        run = jaxouter.learn(plant, out=f"run-{name}", pretraining={"gradient_steps": 500})
+        run = jaxouter.learn(plant, "record", out=f"run-{name}", pretraining={"gradient_steps": 500})
         check.main([plant])
         assert re.search(r"DC gain\W+0\.5, y = ", capsys.readouterr().out)
         figures = {key: found.figures.mae / unit for key, found in run.evaluate().items()}

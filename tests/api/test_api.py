@@ -142,7 +142,7 @@ def test_in_a_thread_and_silent(tmp_path, capsys):
 
 MISTAKES = [
     (dict(plant="boat"), "there is no plant 'boat'"),
-    (dict(preset="best"), "there is no preset 'best' for pitch; the presets are: default, robust, paper"),
+    (dict(preset="best"), "there is no preset 'best' for pitch; the presets are: default, scratch, record, robust,"),
     (dict(steps=-1), "steps is -1; it must be positive"),
     (dict(pretraining={"gradient_step": 1}), "there is no option 'pretraining.gradient_step'; there are: "),
     (dict(pretraining=5), "pretraining is 5; it has settings of its own, such as pretraining.gradient_steps"),

@@ -21,6 +21,10 @@ TINY = [
 ]  # of the command
 
 
+PAIRS = ["--pairs.rounds", "1", "--pairs.states", "64", "--pairs.environments", "4", "--pairs.horizon", "5"]
+PAIRS += ["--pairs.updates", "4", "--pairs.batch-size", "16", "--compared", "16"]
+
+
 def with_agent(config: TrainConfig, **changes) -> TrainConfig:
     """The configuration with other settings of its agent."""
     return replace(config, agent=replace(config.agent, **changes))
@@ -32,5 +36,5 @@ def small(plant: str = "heaters", name: str = "record", **changes) -> TrainConfi
     of_agent = dict(hidden=(16, 16), batch_size=32, n_step=1, prefill=640, updates=1, replay=1_600)
     of_agent |= {f.name: changes.pop(f.name) for f in fields(base.agent) if f.name in changes}
     own = dict(steps=3_040, epoch=960, environments=8, history=3, base="absolute", pretraining=PretrainingConfig())
-    own |= dict(correction=1.0, reward=RewardConfig(), disturbances=Disturbances())
+    own |= dict(correction=1.0, reward=RewardConfig(), disturbances=Disturbances(), compared=0)
     return with_agent(replace(base, **{**own, **changes}), **of_agent)

@@ -80,9 +80,7 @@ def test_errors_name_field_value_and_what_is_allowed(change, text):
 
 
 def test_unknown_preset_lists_those_that_exist():
-    with pytest.raises(
-        ValueError, match="no preset 'fast' for heaters; the presets are: default, scratch, record,"
-    ):
+    with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, scratch, record,"):
         preset("heaters", "fast")
 
 
@@ -92,9 +90,7 @@ def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
         wanted = replace(preset("pitch", name), plant="lag", correction=correction)
         wanted = replace(wanted, reward=replace(wanted.reward, beta_h=0.1))
         assert preset("lag", name).check() == wanted
-    with pytest.raises(
-        ValueError, match="no preset 'robust' for lag; the presets are: default, scratch, record,"
-    ):
+    with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, scratch, record,"):
         preset("lag", "robust")
 
 

@@ -21,13 +21,13 @@ from jaxouter.training.devices import Processes
 from jaxouter.training.run import RunFolder
 from tests import interrupts
 from tests.precision import of_single_draws
-from tests.training.small import small
+from tests.training.small import PAIRS, small
 
 HERE = Path(__file__).parent
 OPTIONS = ["--steps", "1040", "--agent.prefill", "640", "--epoch", "8", "--environments", "8", "--agent.replay", "1600"]
 OPTIONS += ["--agent.hidden", "16", "16", "--agent.batch-size", "32", "--agent.updates", "1"]
 OPTIONS += ["--history", "3", "--base", "absolute"]
-OPTIONS += ["--pretraining.gradient-steps", "0"]
+OPTIONS += PAIRS
 
 
 @of_single_draws

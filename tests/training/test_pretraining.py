@@ -211,7 +211,7 @@ def test_a_model_longer_than_half_an_episode_is_refused(config):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        *(("gradient_steps", -1), ("noise", -1.0), ("load", -1.0), ("log_above", -1.0)),
+        *(("gradient_steps", -1), ("log_above", -1.0)),
         *(("episodes", 0), ("episode_steps", 0), ("lags", 0), ("batch_size", 0), ("plants", 0)),
     ],
 )

@@ -82,7 +82,7 @@ def test_score_is_the_mean_return_that_the_learner_is_trained_on_and_minus_infin
 
 def test_baselines_meet_the_noise_and_the_loads_of_the_learner():
     found = learners_episodes(PLANT, lag.make()[1], KEY)
-    start, noise, load = preset("lag").pretraining, np.asarray(found.sensor.noise), np.asarray(found.load)
+    start, noise, load = preset("lag").disturbances, np.asarray(found.sensor.noise), np.asarray(found.load)
     assert 0.0 < noise.max() <= start.noise * SPAN / 2
     assert 0.2 < np.mean(noise == 0.0) < 0.8
     assert load.shape == found.r.shape
