@@ -199,6 +199,21 @@ class Reaimed:
         return SetPointState(key, r), r
 
 
+@dataclass(frozen=True)
+class Still:
+    """A reference that stays as it is; the state is r."""
+
+    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """To stay at the first output."""
+        del key
+        return y0, y0
+
+    def step(self, state: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The same."""
+        del y
+        return state, state
+
+
 class FamilyState(NamedTuple):
     """State of `Family`."""
 

@@ -33,6 +33,20 @@ class TrainState(NamedTuple):
     pairs: Any = ()  # of the rounds of pairs
 
 
+def step_with(
+    env: Environment,
+    policy: LearnedPolicy,
+    base: LinearLaw,
+    params: EnvParams,
+    state: EnvState,
+    action: jax.Array,
+    key: chex.PRNGKey,
+) -> tuple[jax.Array, EnvState, jax.Array, jax.Array]:
+    """One step of an environment, without reset, under an action in [-1, 1]: obs, state, reward, terminated."""
+    r_tilde = policy.r_tilde(base, state.memory, state.r, state.y_seen, action)
+    return env.step_env(key, state, r_tilde, params)[:4]
+
+
 class Step(NamedTuple):
     """One step of every environment, (E, ...)."""
 
@@ -167,8 +181,7 @@ class Environments:
         def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
             obs, env, weight = carry
             action = self.policy.action(learned.actor, obs)
-            r_tilde = self.policy.r_tilde(state.base, env.memory, env.r, env.y_seen, action)
-            obs, env, reward, terminated, _, _ = self.env.step_env(key, env, r_tilde, params)
+            obs, env, reward, terminated = step_with(self.env, self.policy, state.base, params, env, action, key)
             return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
 
         key_reset, key_run = jax.random.split(key)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.loop.policy import LinearLaw
+from jaxouter.training.environments import step_with
 from jaxouter.training.policy import LearnedPolicy
 
 STRATA = 8
@@ -46,8 +47,7 @@ def reward_of(
 
     def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
         obs, state = carry
-        r_tilde = policy.r_tilde(base, state.memory, state.r, state.y_seen, policy.action(actor, obs))
-        obs, state, reward, *_ = env.step_env(key, state, r_tilde, params)
+        obs, state, reward, _ = step_with(env, policy, base, params, state, policy.action(actor, obs), key)
         return (obs, state), reward
 
     keys = jax.random.split(key_run, env.plant.episode_steps)

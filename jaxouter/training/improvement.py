@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -15,26 +15,14 @@ from jaxouter.agents.noise import ornstein_uhlenbeck
 from jaxouter.agents.pairs import SHARES, Pairs, PairsLearner, PairsState
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.policy import LinearLaw
+from jaxouter.loop.references import Still
+from jaxouter.training.environments import step_with
 from jaxouter.training.gate import Comparison, compare
 from jaxouter.training.policy import LearnedPolicy
 
 GROWTH, CUT, LEAST = 1.3, 1 / 1.5, 1 / 32  # of the rate, where all of it is kept or not
 CHECKED = 2.0  # standard errors by which a stratum may be worse than under the base law alone
 THETA = 0.15  # of the exploration
-
-
-class Still(NamedTuple):
-    """A goal that stays as it is; its state is r."""
-
-    def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """To stay at the first output."""
-        del key
-        return y0, y0
-
-    def step(self, state: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The same."""
-        del y
-        return state, state
 
 
 @dataclass(frozen=True)
@@ -121,8 +109,7 @@ class Improvement:
             normal, key = xs
             noise = ornstein_uhlenbeck(noise, normal, THETA, sigma)
             action = jnp.clip(self.policy.action(actor, obs) + noise, -1.0, 1.0)
-            r_tilde = self.policy.r_tilde(base, state.memory, state.r, state.y_seen, action)
-            obs, after, _, terminated, _, _ = self.env.step_env(key, state, r_tilde, params)
+            obs, after, _, terminated = step_with(self.env, self.policy, base, params, state, action, key)
             return (obs, after, noise, alive & ~terminated), (state, alive)
 
         begin = obs, state, jnp.zeros(()), jnp.ones((), bool)
@@ -141,11 +128,9 @@ class Improvement:
             def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
                 obs, state, change, weight = carry
                 action = self.policy.action(actor, obs) + change
-                r_tilde = self.policy.r_tilde(base, state.memory, state.r, state.y_seen, action)
-                obs, state, reward, terminated, _, _ = env.step_env(key, state, r_tilde, params)
-                return (obs, state, jnp.zeros_like(change), weight * gamma * jnp.where(terminated, 0.0, 1.0)), (
-                    weight * reward
-                )
+                obs, state, reward, terminated = step_with(env, self.policy, base, params, state, action, key)
+                after = weight * gamma * jnp.where(terminated, 0.0, 1.0)
+                return (obs, state, jnp.zeros_like(change), after), weight * reward
 
             begin = obs, state._replace(goal=state.r), change, jnp.ones_like(change)
             return self.reward_scale * jnp.sum(jax.lax.scan(step, begin, keys)[1])

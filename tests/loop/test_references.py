@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, held, redrawn, telegraph, wander
+from jaxouter.loop.references import FAMILIES, Family, Goal, Reaimed, SetPoint, Still, held, redrawn, telegraph, wander
 from tests.precision import FLOAT
 
 KEY = jax.random.key(0)
@@ -204,7 +204,7 @@ def test_family_goal_plays_its_trajectory_and_holds_the_end(kind: str) -> None:
     np.testing.assert_array_equal(r[60:], r[59])
 
 
-@pytest.mark.parametrize("goal", [SetPoint(0.0, 1.0), Reaimed(0.0, 1.0, 0.1), Family("days", 24, 0.0, 1.0)])
+@pytest.mark.parametrize("goal", [Still(), SetPoint(0.0, 1.0), Reaimed(0.0, 1.0, 0.1), Family("days", 24, 0.0, 1.0)])
 def test_goals_are_static(goal: Goal) -> None:
     assert hash(goal) == hash(type(goal)(*vars(goal).values()))
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxouter.loop.disturbances import Disturbances
+from jaxouter.loop.references import Still
 from jaxouter.loop.rewards import RewardConfig
 from jaxouter.training.devices import Fleet
 from jaxouter.training.environments import EPISODES
-from jaxouter.training.improvement import Still
 from jaxouter.training.off_policy import FIELDS
 from jaxouter.training.trainer import DIAGNOSIS, build
 from tests.precision import X64, makes_nan
