@@ -95,7 +95,7 @@ def test_compared_and_live(folder, tmp_path, monkeypatch):
     assert tuned.settings["gain"] > 0
     assert set(content.sweeps) == {"Room/tau"}
     radii = [row.spectral_radius for row in content.stability if row.policy == "learned"]
-    assert len(radii) == 2 * 5  # of the stability scenarios, at five set-points each
+    assert len(radii) == 2 * 19  # of the stability scenarios, at nineteen set-points each
     assert all(0.0 < radius < 1.0 for radius in radii)
     Path("loop.py").write_text(STEP)
     live.main(["loop.py:step", "--run", str(folder / "seed-0"), *named, "--dt", "0.05", "--steps", "20", "--learn"])

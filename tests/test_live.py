@@ -42,14 +42,16 @@ def begun(tmp_path_factory):
 @pytest.mark.slow
 def test_it_begins_from_nothing_in_real_time(begun):
     out, folder = begun
-    for text in ("step 0: recording", ": static", "missed deadlines", "us (p99)", "r~ = r"):
+    for text in ("step 0: recording", ": static", ": lq", "missed deadlines", "us (p99)", "r~ = r"):
         assert text in out
     summary = json.loads((folder / "live" / "summary.json").read_text())
     assert summary["steps"] == 500 == sum(summary["counts"].values())
-    assert summary["counts"]["static"] + summary["counts"]["learned"] > 100
+    assert sum(summary["counts"][name] for name in ("static", "lq", "learned")) > 100
     assert summary["missed_deadlines"] == summary["counts"]["late"]
     assert summary["updates"] > 50
-    assert summary["base"]["r"] == pytest.approx(1 / 0.7, rel=0.1)
+    law = summary["base"]  # the LQ law, which integrates
+    assert law["r"] == -law["y"] > 0.0
+    assert sum(law["r_tilde_past"]) == pytest.approx(1.0, abs=1e-4)
     assert 0.0 < summary["act_us"]["p50"] < summary["act_us"]["p99"]
     last = summary["mae"]["last quarter"]
     assert last["y"] < last["y_passed"]

@@ -205,8 +205,8 @@ def test_a_plant_may_be_a_function_or_task_of_this_process(tmp_path):
     def cellar(outside=5.0):
         return room.make(outside=outside)
 
-    settings = {"gradient_steps": 2, "episodes": 2}
-    run = jaxouter.learn(cellar, out=tmp_path / "run", progress=False, set={"outside": 2.0}, pretraining=settings)
+    settings = dict(base="static", pretraining={"gradient_steps": 2, "episodes": 2}, progress=False)
+    run = jaxouter.learn(cellar, "record", out=tmp_path / "run", set={"outside": 2.0}, **settings)
     assert run.config.plant == "cellar(outside=2.0)"
     assert "a Python object cellar" in (run.path / "config.json").read_text()
     assert jaxouter.load(run.path, plant=cellar).policy.plant == "cellar(outside=2.0)"

@@ -33,6 +33,7 @@ def test_a_controller_from_a_log_is_better_on_the_true_plant(path: Path, monkeyp
     trainer, params = build(config)
     state = trainer.start(0, params)
     plant, of_plant = lag.make()
+    monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
     episodes = training_episodes(plant, of_plant, jax.random.key(1), 64)
     reached = score(trainer.policy, trainer.policy_params(state), episodes)
     assert reached > 0.7 * score(*none(plant), episodes)  # both negative
