@@ -9,6 +9,7 @@ change, and the actor follows the critic's gradient, as in DDPG.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import chex
@@ -18,6 +19,7 @@ import optax
 
 from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.networks import AdvantageCritic, before_tanh
+from jaxouter.agents.whitening import Whitening
 
 SHARES = (1.0, 0.3, 0.1)  # of what the actor learned in a round, of which the best is kept
 
@@ -92,6 +94,7 @@ class PairsState(NamedTuple):
     actor_optimiser: optax.OptState
     pairs: Pairs  # (kept x states, ...)
     scale: jax.Array  # standard deviation of the gains of the first round
+    white: Whitening  # of its observations, on which both networks learn
     rate: jax.Array  # share of the actor's learning rate
     rounds: jax.Array  # int32, so far
 
@@ -129,6 +132,7 @@ class PairsLearner:
             actor_optimiser=adam(self.config.actor_rate).init(actor),
             pairs=Pairs(jnp.zeros((size, self.obs_size)), nothing, nothing, nothing),
             scale=jnp.ones(()),
+            white=Whitening(jnp.zeros(self.obs_size), jnp.eye(self.obs_size)),
             rate=jnp.ones(()),
             rounds=jnp.zeros((), jnp.int32),
         )
@@ -140,8 +144,10 @@ class PairsLearner:
         def put(old: jax.Array, new: jax.Array) -> jax.Array:
             return jax.lax.dynamic_update_slice_in_dim(old, new, at, 0)
 
-        scale = jnp.where(state.rounds == 0, jnp.maximum(jnp.std(pairs.gain), 1e-12), state.scale)
-        return state._replace(pairs=jax.tree.map(put, state.pairs, pairs), scale=scale, rounds=state.rounds + 1)
+        first = jnp.maximum(jnp.std(pairs.gain), 1e-12), Whitening.of(pairs.obs)
+        scale, white = jax.tree.map(partial(jnp.where, state.rounds == 0), first, (state.scale, state.white))
+        pairs = jax.tree.map(put, state.pairs, pairs)
+        return state._replace(pairs=pairs, scale=scale, white=white, rounds=state.rounds + 1)
 
     def learn(self, state: PairsState, actor: Any, key: chex.PRNGKey) -> tuple[PairsState, Any, dict[str, jax.Array]]:
         """Updates of the critic, then of the actor, from the pairs that are kept.
@@ -154,8 +160,12 @@ class PairsLearner:
         shape = (2, config.updates, config.batch_size)
         rows = jax.random.randint(key, shape, 0, most)
 
-        def update_critic(state: PairsState, rows: jax.Array) -> tuple[PairsState, jax.Array]:
+        def drawn(rows: jax.Array) -> Pairs:
             batch = jax.tree.map(lambda leaf: leaf[rows], state.pairs)
+            return batch._replace(obs=state.white(batch.obs))
+
+        def update_critic(state: PairsState, rows: jax.Array) -> tuple[PairsState, jax.Array]:
+            batch = drawn(rows)
 
             def loss(critic: Any) -> jax.Array:
                 return jnp.mean((self.gain(critic, batch.obs, batch.change) - batch.gain / state.scale) ** 2)
@@ -170,7 +180,7 @@ class PairsLearner:
 
         def update_actor(carry: Any, rows: jax.Array) -> tuple[Any, None]:
             actor, optimiser = carry
-            batch = jax.tree.map(lambda leaf: leaf[rows], state.pairs)
+            batch = drawn(rows)
 
             def loss(actor: Any) -> jax.Array:
                 output = before_tanh(self.hidden, actor, batch.obs)[:, 0]
@@ -179,5 +189,10 @@ class PairsLearner:
 
             return descend(of_actor, jax.grad(loss)(actor), optimiser, actor), None
 
-        (actor, optimiser), _ = jax.lax.scan(update_actor, (actor, state.actor_optimiser), rows[1])
-        return state._replace(actor_optimiser=optimiser), actor, {"pairs_loss": jnp.mean(losses[-20:])}
+        begin = state.white.unfolded(actor), state.actor_optimiser
+        (actor, optimiser), _ = jax.lax.scan(update_actor, begin, rows[1])
+        return (
+            state._replace(actor_optimiser=optimiser),
+            state.white.folded(actor),
+            {"pairs_loss": jnp.mean(losses[-20:])},
+        )

@@ -45,7 +45,7 @@ class RewardConfig:
     """G: errors below this share of the set-point range count by their square, larger ones less half of it; 0: none.
     Without it |r - y| has a kink at rest, about which the loop swings."""
     rest: float = 0.0
-    """H: price of a move d below rho_h while r rests, times d^2 / rho_h; 0: none. Else such moves are free."""
+    """H: price of a move d while r rests, beside that of H: of d from rho_h on, of d^2 / rho_h below; 0: none."""
     rest_after: int = 30
     """H: control steps after which an unchanged r rests."""
     terms: float = 1.0
@@ -77,7 +77,7 @@ class RewardParams:
     rate_limit: jax.Array  # on a move of y
     divergence: jax.Array  # added when an episode ends by divergence
     huber: jax.Array | None  # width about zero in which the error is squared
-    rest: jax.Array | None  # price of small moves of r~ while r rests
+    rest: jax.Array | None  # price of moves of r~ while r rests
     rest_after: jax.Array  # control steps after which it does
     terms: jax.Array  # weight of the plant's own terms
 
@@ -118,8 +118,8 @@ def rounded(e: jax.Array, width: jax.Array) -> jax.Array:
 
 
 def at_rest(delta: jax.Array, beta: jax.Array, rho: jax.Array) -> jax.Array:
-    """A move delta >= 0 below rho while r rests: priced by its square, and at rho like a larger one."""
-    return jnp.where(delta < rho, -beta * delta * (delta / jnp.where(rho > 0.0, rho, 1.0)), 0.0)
+    """A move delta >= 0 while r rests: priced by its square below rho, and linearly from there on."""
+    return -beta * delta * jnp.where(delta < rho, delta / jnp.where(rho > 0.0, rho, 1.0), 1.0)
 
 
 def moves(delta: jax.Array, beta: jax.Array, rho: jax.Array) -> jax.Array:

@@ -23,13 +23,12 @@ RECORD = {
     "disturbances.noise": 0.02,
     "disturbances.load": 0.2,
 }
-DEFAULT = {**RECORD, "pairs.change": 0.1}
+DEFAULT = {**RECORD, "reward.beta_h": 0.06, "reward.delta_b": 2.0, "pairs.change": 0.1}
 SCRATCH = {
     **HOURLY,
     "agent.n_step": 3,
     "agent.updates": 3,
     "agent.noise_sigma": (0.005, 0.05),
-    "pairs.change": 0.08,
     "pairs.horizon": 24,
 }
 ROBUST = {

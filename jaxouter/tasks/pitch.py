@@ -17,7 +17,7 @@ DELAYED = (10.13, 2.46)  # the paper's only delayed case; no reading of it gives
 
 # The linear law is nearly the best there is: small corrections, for which moves of r~ cost nothing.
 RECORD = {"correction": 0.1, "reward.beta_h": 0.0}
-DEFAULT = RECORD
+DEFAULT = {**RECORD, "reward.rest": 0.02}
 ROBUST = {
     "base": "static",
     "correction": 1.0,

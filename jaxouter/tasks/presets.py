@@ -56,9 +56,8 @@ SCRATCH: Options = {
     "agent.prefill": 12_800,
     "agent.replay": 102_400,
     "agent.noise_sigma": (0.005, 0.03),
-    "pairs.rounds": 20,
-    "pairs.change": 0.04,
-    "pairs.actor_rate": 3e-4,
+    "pairs.rounds": 30,
+    "pairs.change": 0.1,
     "pairs.noise_sigma": (0.005, 0.03),
 }
 PRESETS: Mapping[str, Options] = {"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "paper": PAPER}

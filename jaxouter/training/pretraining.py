@@ -3,8 +3,8 @@
 `DifferentiableRollout` takes any differentiable plant. Training passes a model identified from recorded r~ and y alone;
 the baseline `oracle` passes the plant itself.
 
-The first layer is trained on whitened observations, and the whitening is then folded into it: consecutive samples of y
-differ little, but these small differences carry the state of the plant.
+The first layer is trained on whitened observations (`jaxouter.agents.whitening`), and the whitening is then folded into
+it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import optax
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
+from jaxouter.agents.whitening import Whitening
 from jaxouter.identification import counterfactual, records
 from jaxouter.identification.records import Record
 from jaxouter.loop.episodes import TrainingEpisodes
@@ -38,7 +39,6 @@ CHUNK = 50  # gradient steps between two reports
 LAST, COLLAPSED = 5, 2.0  # the loop has become unstable if the last 5 steps' mean cost is twice the best one
 SHORT = 1 / 3  # first share of the gradient steps, with episodes no longer than the plant's
 CUT, GROWTH = 0.5, 1.25  # factors on the learning rate after a chunk that became unstable, and after one that did not
-FLOOR = 1e-2  # least standard deviation in the whitening
 EPISODES = "episodes"  # axis over which devices share the episodes
 
 
@@ -63,13 +63,6 @@ Report = Callable[[PretrainingState, Callable[[], Any]], None]
 """`report(at, actor)`: called now and then with the state of the pretraining, and a function that gives its actor."""
 Say = Callable[[str, int, int], None]
 """`say(what, done, of)`: called with the phase ("recording", "compiling") and its progress; 0 of 0 if unknown."""
-
-
-class Whitening(NamedTuple):
-    """(obs - mean) @ matrix has nearly unit covariance."""
-
-    mean: jax.Array  # (n,)
-    matrix: jax.Array  # (n, n)
 
 
 @dataclass(frozen=True)
@@ -118,8 +111,7 @@ class DifferentiableRollout:
             )
 
         obs = jax.vmap(observed)(jax.random.split(key, self.batch)).reshape(-1, self.policy.observer.size)
-        variance, axes = jnp.linalg.eigh(jnp.cov(obs, rowvar=False))
-        return Whitening(obs.mean(0), (axes / jnp.sqrt(jnp.maximum(variance, 0.0) + FLOOR**2)[None]) @ axes.T)
+        return Whitening.of(obs)
 
     @partial(jax.jit, static_argnums=0)
     def train(
@@ -138,7 +130,7 @@ class DifferentiableRollout:
         """
 
         def loss(actor: Any, keys: chex.PRNGKey) -> jax.Array:
-            params = LearnedParams(folded(actor, white), base)
+            params = LearnedParams(white.folded(actor), base)
             cost = jax.vmap(lambda key: -self.mean_reward(params, plant_params, key))(keys)
             return jnp.mean(self.log_above * jnp.log1p(cost / self.log_above) if self.log_above else cost)
 
@@ -171,15 +163,6 @@ class DifferentiableRollout:
 
 
 ADAM = optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam())
-
-
-def folded(actor: Any, white: Whitening) -> Any:
-    """The actor on plain observations, from one whose first layer takes whitened ones."""
-    layers = actor["params"]
-    first = min(layers)
-    kernel = white.matrix @ layers[first]["kernel"]
-    bias = layers[first]["bias"] - white.mean @ kernel
-    return {"params": layers | {first: {"kernel": kernel, "bias": bias}}}
 
 
 def cosine(steps: int) -> jax.Array:
@@ -261,7 +244,7 @@ def pretrain(
     rates, at = cosine(config.gradient_steps), PretrainingState.begin(learned.actor) if begin is None else begin
 
     def actor() -> Any:
-        return folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]), white)
+        return white.folded(jax.tree.map(lambda leaf: leaf[0], at.now[0]))
 
     while (done := int(at.done)) < config.gradient_steps:
         chunk, stage = at.rate_scale * rates[done : done + CHUNK], stages[done >= longer]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
+from jaxouter.agents.whitening import Whitening
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.identification import counterfactual, records, steady_state
 from jaxouter.loop.disturbances import Disturbances
@@ -15,7 +16,7 @@ from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.training import pretraining
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.epochs import train
-from jaxouter.training.pretraining import ADAM, DifferentiableRollout, Whitening
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout
 from jaxouter.training.run import RunFolder, RunWarning
 from jaxouter.training.trainer import build
 from tests import lag

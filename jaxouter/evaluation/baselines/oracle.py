@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from jaxouter.agents.whitening import Whitening
 from jaxouter.evaluation.baselines import exact
 from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned, cached
@@ -30,7 +31,7 @@ from jaxouter.loop.rewards import RewardConfig
 from jaxouter.plants import Plant, make
 from jaxouter.training.config import TrainConfig, to_dict
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, folded, pretrain
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, pretrain
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
@@ -125,7 +126,7 @@ def train(rollout: DifferentiableRollout, params: Any, base: LinearLaw, key: che
     actors = jax.vmap(lambda key: rollout.policy.init_actor(jax.random.split(key)[0]))(
         jax.random.split(key_seeds, SEEDS)
     )
-    fold = jax.jit(jax.vmap(folded, (0, None)))
+    fold = jax.jit(jax.vmap(Whitening.folded, (None, 0)))
     stages: list[np.ndarray] = []  # returns (seeds,) after each
     best, gradient_steps = actors, 0
     for stage in range(STAGES):
@@ -139,10 +140,10 @@ def train(rollout: DifferentiableRollout, params: Any, base: LinearLaw, key: che
             done = gradient_steps + i + CHUNK
             report(f"{done:,} of at most {MOST:,} gradient steps", done / MOST)
         actors, gradient_steps = carry[0], gradient_steps + length
-        stages.append(np.asarray(returns(rollout, fold(actors, white), base, params, key_test)))
+        stages.append(np.asarray(returns(rollout, fold(white, actors), base, params, key_test)))
         so_far = [values.max() for values in stages]
         if so_far[-1] == max(so_far):
-            best = jax.tree.map(lambda leaf: leaf[stages[-1].argmax()], fold(actors, white))
+            best = jax.tree.map(lambda leaf: leaf[stages[-1].argmax()], fold(white, actors))
         if stage and so_far[-1] - max(so_far[:-1]) < ENOUGH * abs(so_far[-1]):
             break
     settings = {"gradient_steps": gradient_steps, "returns": [values.round(3).tolist() for values in stages]}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
+from jaxouter.agents.whitening import Whitening
 from jaxouter.evaluation.baselines import mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import score, training_episodes
 from jaxouter.evaluation.metrics import mae
@@ -16,7 +17,6 @@ from jaxouter.identification import linear_models, records, steady_state
 from jaxouter.loop.policy import Linear
 from jaxouter.training.config import PretrainingConfig, preset
 from jaxouter.training.policy import LearnedParams
-from jaxouter.training.pretraining import Whitening, folded
 from jaxouter.training.trainer import build
 from tests import lag
 from tests.training.small import small as small_run
@@ -116,7 +116,7 @@ def test_folded_acts_like_the_network_on_whitened_observations(rollout):
     actor["params"]["Dense_2"]["kernel"] = 30.0 * actor["params"]["Dense_2"]["kernel"]  # not too small to see
     obs = jnp.asarray(rng.normal(size=(20, size)), float)
     act = jax.vmap(rollout.policy.action, (None, 0))
-    found, expected = act(folded(actor, white), obs), act(actor, (obs - white.mean[None]) @ white.matrix)
+    found, expected = act(white.folded(actor), obs), act(actor, (obs - white.mean[None]) @ white.matrix)
     np.testing.assert_allclose(found, expected, atol=1e-4)
     assert np.ptp(expected) > 0.1
 
