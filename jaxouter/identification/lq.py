@@ -8,6 +8,7 @@ other r~ (`counterfactual`), with other set-points, noise and loads.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -22,6 +23,7 @@ import scipy.linalg
 from jaxouter.identification import counterfactual
 from jaxouter.identification.records import Record
 from jaxouter.identification.steady_state import IdentificationWarning
+from jaxouter.loop import rewards
 from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import Linear, LinearLaw
@@ -30,10 +32,11 @@ from jaxouter.plants.base import excess
 
 LAGS = (15, 30, 60)
 NOISES = (2e-3, 6e-3, 2e-2, 6e-2)  # standard deviation in the fit; 1 is half the set-point range
-PRICES = tuple(np.geomspace(1e-3, 100.0, 11).tolist())  # of a squared move, in squared errors; both in half ranges
+PRICES = tuple(np.geomspace(1e-4, 100.0, 13).tolist())  # of a squared move, in squared errors; both in half ranges
 EPISODES = 64  # on which the laws are compared
 WITHIN = 1e-3  # share of steps outside the plant's limits that a law may have beyond those of the static prefilter
-NOISIER = 0.5  # largest standard deviation of y at rest over that of measurement noise
+NOISIER = 0.5  # largest standard deviation of y at rest over that of measurement noise, where that is not known
+MEAN_OF_NOISE = math.sqrt(2 / math.pi)  # mean of |x| over its standard deviation, x normal
 REST = 0.1  # least share of a deviation that must die out in an episode
 PLANTS = 8  # at most, at whose equilibria a law must come to rest
 DOUBLINGS = 60  # at most: a horizon of 2^60 steps
@@ -202,9 +205,10 @@ def choose(
 ) -> Choice:
     """The best LQ law on held-out episodes of the records' own models.
 
-    A law counts if it stays within the plant's limits, up to 0.1 % of the steps more than the static prefilter, and if
-    it comes to rest at a held set-point: a deviation dies out by a tenth or more in an episode, and measurement noise
-    moves y by half its own standard deviation or less.
+    What the loudest noise adds to the mean |y| counts beside the MAE: few episodes have much noise, and a law that is
+    best in the others may be useless there. A law counts if it stays within the plant's limits, up to 0.1 % of the
+    steps more than the static prefilter, and if it comes to rest at a held set-point: a deviation dies out by a tenth
+    or more in an episode.
 
     Args:
         plant: as declared; it is not simulated.
@@ -237,9 +241,11 @@ def choose(
     mae, reward, outside = (np.asarray(each, np.float64) for each in _compared(episodes, together, replayed, key))
     responses = [[np.asarray(each[0], np.float64) for each in (model.a, model.b)] for model in models[:PLANTS]]
     counts = np.isfinite(mae) & (outside <= outside[0] + WITHIN)
-    if on is None:
-        counts &= np.max([amplification(numbers, a, b, 2 * steps) for a, b in responses], axis=0) <= NOISIER
-    order = np.argsort(np.where(counts, mae if figure == "mae" else -reward, np.inf)[1:], kind="stable")
+    cost, noise = mae if figure == "mae" else -reward, disturbances.noise * float(np.ptp(plant.setpoint_range)) / 2
+    if noise:
+        louder = np.max([amplification(numbers, a, b, 2 * steps) for a, b in responses], axis=0)
+        cost = cost + (1.0 if figure == "mae" else rewards.PAPER.alpha_g) * MEAN_OF_NOISE * noise * louder
+    order = np.argsort(np.where(counts, cost, np.inf)[1:], kind="stable")
     for i in order[: np.count_nonzero(counts[1:])]:
         if all(radius(laws[i], a, b) <= 1.0 - REST / plant.episode_steps for a, b in responses):
             return Choice(laws[i], settings[i], float(mae[1 + i]), float(mae[0]), most)
