@@ -25,6 +25,7 @@ from jaxouter.plants import Plant
 EXPLORED = 8  # episodes from which order and dead time are identified
 DRAWN = 4  # plants to identify if each episode draws another plant
 SHOWN = 0.99  # y shows r~ if r~ reduces the prediction error below this share
+ROUNDING = 1e-6  # share of y below which nothing is an effect
 NEGLIGIBLE = 0.01  # of the largest coefficient of r~; leading ones below are dead time
 ENOUGH = 20  # cap on the past samples in an observation for a high order ...
 BEYOND = 8  # ... but after a long dead time up to this many more
@@ -47,7 +48,8 @@ def of_record(data: Record) -> Dynamics:
     n, dead = len(arx.a), arx.dead
     model, horizon = as_model(arx), max(1, min(round(HORIZON * steps), (steps - n - dead) // 3))
     deaf = fit_arx(data._replace(r_tilde=np.zeros_like(data.r_tilde)), n, dead)
-    shown = prediction_error(arx, data, horizon) < SHOWN * prediction_error(deaf, data, horizon)
+    missed = prediction_error(deaf, data, horizon)  # without r~
+    shown = ROUNDING * np.nanmax(np.abs(data.y)) < missed and prediction_error(arx, data, horizon) < SHOWN * missed
     kind = kind_of(model, steps)
     dead += int(np.argmax(np.abs(arx.b) > NEGLIGIBLE * np.abs(arx.b).max()))
     return Dynamics(n, dead, settling(model) if kind == "stable" else math.inf, kind, shown)

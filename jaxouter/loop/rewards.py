@@ -45,7 +45,7 @@ class RewardConfig:
     """G: errors below this share of the set-point range count by their square, larger ones less half of it; 0: none.
     Without it |r - y| has a kink at rest, about which the loop swings."""
     rest: float = 0.0
-    """H: price of a move d while r rests, beside that of H: of d from rho_h on, of d^2 / rho_h below; 0: none."""
+    """H: least price of a move d while r rests: of d from rho_h on, of d^2 / rho_h below; 0: none."""
     rest_after: int = 30
     """H: control steps after which an unchanged r rests."""
     terms: float = 1.0
@@ -77,7 +77,7 @@ class RewardParams:
     rate_limit: jax.Array  # on a move of y
     divergence: jax.Array  # added when an episode ends by divergence
     huber: jax.Array | None  # width about zero in which the error is squared
-    rest: jax.Array | None  # price of moves of r~ while r rests
+    rest: jax.Array | None  # least price of moves of r~ while r rests
     rest_after: jax.Array  # control steps after which it does
     terms: jax.Array  # weight of the plant's own terms
 
@@ -164,5 +164,6 @@ def reward(
     )
     own = [p.terms * term(r, y, y_before, r_tilde, r_tilde_before) for term in terms]
     if p.rest is not None:
-        own.append(jnp.where(held >= p.rest_after, at_rest(delta, p.rest, p.rho_h), 0.0))
+        more = jnp.minimum(at_rest(delta, p.rest, p.rho_h) - moves(delta, p.beta_h, p.rho_h), 0.0)
+        own.append(jnp.where(held >= p.rest_after, more, 0.0))
     return sum(own, of_paper)

@@ -294,7 +294,7 @@ class Live:
         mirror, dtype = self.replay.mirror, base.r.dtype
         rings = replay.rows[:, mirror:]
         r, y, r_tilde, age = (rings[..., FIELDS.index(name)].astype(dtype) for name in ("r", "y", "r_tilde", "age"))
-        starts = (jnp.arange(rings.shape[1])[None] - age.astype(jnp.int32)) % rings.shape[1]
+        starts = (jnp.arange(rings.shape[1], dtype=jnp.int32)[None] - age.astype(jnp.int32)) % rings.shape[1]
         y0 = jnp.take_along_axis(y, starts, 1)
         before = jnp.clip(y0, *self.observer.r_tilde_bounds)
         law = base.offset + base.r * r + base.y * y

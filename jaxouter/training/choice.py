@@ -112,7 +112,7 @@ def _longer(steps: int) -> str:
 def _pretraining(config: TrainConfig, plant: Plant, lags: int, dead: int) -> tuple[PretrainingConfig, tuple[str, ...]]:
     """Pretraining with lags (at most half a recorded episode) and length of recorded episodes; and warnings."""
     start = config.pretraining
-    if not start.gradient_steps or plant.identified:
+    if not config.records or plant.identified:
         return start, ()
     if start.lags is not None:
         wrong = f"the dead time of {dead} control steps does not fit in --pretraining.lags {start.lags}; set {lags}"

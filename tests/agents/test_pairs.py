@@ -39,11 +39,11 @@ def test_the_actor_moves_to_the_action_that_gains_most():
         return float(jnp.abs(act(HIDDEN, actor, obs)[:, 0] - 0.5 * obs[:, 0]).mean())
 
     before = wrong()
-    for i in range(3):
+    for i in range(6):
         state, actor, metrics = learn(learner.add(state, pairs(actor, i)), actor, jax.random.key(i))
-    assert wrong() < 0.2 * before
+    assert wrong() < 0.3 * before
     assert float(metrics["pairs_loss"]) < 0.2  # of a variance of the gains of about 1
-    assert int(state.rounds) == 3
+    assert int(state.rounds) == 6
 
 
 def test_only_the_newest_rounds_are_kept():

@@ -140,18 +140,18 @@ def test_error_is_rounded_at_zero_where_asked(e: float, expected: float) -> None
 
 
 @pytest.mark.parametrize(("move", "held", "expected"), [
-    (1.75, 30.0, -0.175), (1.75, 29.0, 0.0), (-1.75, 31.0, -0.175), (3.5, 30.0, -0.35), (0.0, 30.0, 0.0)
+    (1.75, 30.0, -0.175), (1.75, 29.0, 0.0), (-1.75, 31.0, -0.175), (3.5, 30.0, -0.7), (3.5, 29.0, -0.35), (0.0, 30.0, 0.0)
 ])  # fmt: skip
-def test_small_moves_are_priced_where_r_rests(move: float, held: float, expected: float) -> None:
-    """By hand: 0.2 * 1.75^2 / 3.5, and as ever from 3.5 on."""
+def test_moves_have_a_least_price_where_r_rests(move: float, held: float, expected: float) -> None:
+    """By hand: 0.2 * 1.75^2 / 3.5; from 3.5 on 0.2 instead of 0.1 of the move."""
     zero = jnp.zeros(())
     price = rewards.params(PITCH, rewards.RewardConfig(rest=0.2))
     found = rewards.reward(price, zero, zero, zero, jnp.asarray(move, float), zero, held=held)
     assert float(found) == pytest.approx(expected)
 
 
-def test_a_plant_whose_moves_all_count_has_no_price_at_rest() -> None:
-    price = rewards.params(PITCH, rewards.RewardConfig(rest=0.2, rho_h=0.0))
+def test_where_moves_cost_more_anyway_rest_adds_nothing() -> None:
+    price = rewards.params(PITCH, rewards.RewardConfig(rest=0.05, rho_h=0.0))
     zero = jnp.zeros(())
     found = rewards.reward(price, zero, zero, zero, jnp.asarray(2.0, float), zero, held=50.0)
     assert float(found) == pytest.approx(-0.2)

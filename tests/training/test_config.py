@@ -86,9 +86,11 @@ def test_unknown_preset_lists_those_that_exist():
 
 def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
     monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
-    for name, correction in (("default", 0.2), ("scratch", 1.0), ("record", 1.0), ("paper", 1.0)):
-        wanted = replace(preset("pitch", name), plant="lag", correction=correction)
-        wanted = replace(wanted, reward=replace(wanted.reward, beta_h=0.1))
+    of_default = dict(correction=0.3), dict(beta_h=0.02, rest=0.05)
+    rest = dict(correction=1.0), dict(beta_h=0.1)
+    for name, (own, of_reward) in dict(default=of_default, scratch=rest, record=rest, paper=rest).items():
+        pitch = preset("pitch", name)
+        wanted = replace(pitch, plant="lag", reward=replace(pitch.reward, **of_reward), **own)
         assert preset("lag", name).check() == wanted
     with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, scratch, record,"):
         preset("lag", "robust")
