@@ -83,6 +83,9 @@ def made(plant: str, preset: str) -> jaxouter.Run:
     shutil.rmtree(out / "figures", ignore_errors=True)
     for name in NOT_KEPT:
         (out / name).unlink(missing_ok=True)
+    older = sorted(out.glob("seed-*/checkpoint-*.npz"))[:-1]
+    for checkpoint in older if preset != "paper" else ():  # whose newest one a test takes away
+        checkpoint.unlink()
     return run
 
 

@@ -140,7 +140,8 @@ def test_error_is_rounded_at_zero_where_asked(e: float, expected: float) -> None
 
 
 @pytest.mark.parametrize(("move", "held", "expected"), [
-    (1.75, 30.0, -0.175), (1.75, 29.0, 0.0), (-1.75, 31.0, -0.175), (3.5, 30.0, -0.7), (3.5, 29.0, -0.35), (0.0, 30.0, 0.0)
+    (1.75, 30.0, -0.175), (1.75, 29.0, 0.0), (-1.75, 31.0, -0.175), (3.5, 30.0, -0.7), (3.5, 29.0, -0.35),
+    (0.0, 30.0, 0.0)
 ])  # fmt: skip
 def test_moves_have_a_least_price_where_r_rests(move: float, held: float, expected: float) -> None:
     """By hand: 0.2 * 1.75^2 / 3.5; from 3.5 on 0.2 instead of 0.1 of the move."""
