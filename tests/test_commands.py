@@ -64,7 +64,7 @@ def test_train_writes_the_run_folder(trained):
     assert config["integral_steps"] == 20.0  # of the preset
     for seed in (3, 4):
         rows = [json.loads(line) for line in (folder / f"seed-{seed}" / "metrics.jsonl").read_text().splitlines()]
-        assert [row["steps"] for row in rows] == [1120, 1600]
+        assert [row["steps"] for row in rows] == [1120, 1600, 15_840, 22_240]  # pairs and check included
         assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
     assert names == {"paper.png", "learning-curve.png", *(f"{name.replace('/', '-')}.png" for name in PLACES)}
@@ -93,7 +93,7 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
     phases = ["preparing", "compiling", "learning", "evaluating", "drawing"]
     assert sorted(phases, key=begun.index) == phases
     (learned,) = (line for line in done.stdout.splitlines() if line.startswith("learned in "))
-    assert re.search(r"  MAE seed 3 \S+, seed 4 \S+ \w+ on \S+/\S+  240 gradient steps$", learned)
+    assert re.search(r"  MAE seed 3 \S+, seed 4 \S+ \w+ on \S+/\S+  256 gradient steps$", learned)
 
 
 def test_evaluate_takes_a_run_and_one_seed_of_it(trained, tmp_path):
@@ -159,7 +159,7 @@ def test_help_shows_the_defaults_of_the_preset(capsys, plant, default):
     ("arguments", "text"),
     [
         (["submarine"], "no plant 'submarine'; the plants are: pitch, heaters"),
-        (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, robust, paper"),
+        (["--preset", "fast"], "no preset 'fast' for pitch; the presets are: default, scratch, record,"),
         (["--steps", "-5"], "steps is -5; it must be positive, or 0 with pretraining"),
         (["--seeds", "0"], "seeds is 0; it must be positive"),
         (["--agent.replay", "100"], "replay is 100; it must hold at least a batch of 256"),

@@ -27,7 +27,14 @@ ROOM = Plant(
 )  # fmt: skip
 Room = Task(
     make=make,
-    presets={"quick": {"pretraining.gradient_steps": 20, "pretraining.episodes": 8, "agent.hidden": (8, 8)}},
+    presets={
+        "quick": {
+            "pretraining.gradient_steps": 20,
+            "pretraining.episodes": 8,
+            "agent.hidden": (8, 8),
+            "pairs.rounds": 0,
+        }
+    },
     scenarios={
         "day": Scenario((20.0, 16.0)),
         "frost": Scenario((20.0,), set={"outside": -15.0}, change={"outside": -20.0}, noise=0.1, episodes=2),

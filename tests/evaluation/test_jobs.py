@@ -527,7 +527,7 @@ def test_policies_say_what_they_are_and_what_they_took(run):
     assert list(known) == ["learned", USER.name, "none", "static", "clairvoyant"]
     assert {name: each.kind for name, each in known.items()} == {c.name: c.kind for c in entrants}
     assert known["learned"].steps == run.config.steps
-    assert known["learned"].settings == {run.path.name: "default"}
+    assert known["learned"].settings == {run.path.name: "record"}
     assert known[USER.name].note == "Twice of own.py"
     assert (known["static"].steps, known["static"].seconds) == (400, 2.5)
     assert known["static"].settings == identified("static", "lag").settings

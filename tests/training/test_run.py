@@ -233,7 +233,7 @@ def test_old_checkpoints_are_removed(tmp_path):
 def test_default_folder_gets_a_number_where_it_exists(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [str(RunFolder.create(small(), None).path) for _ in range(3)]
-    assert names == ["runs/heaters-default-0", "runs/heaters-default-0-2", "runs/heaters-default-0-3"]
+    assert names == ["runs/heaters-record-0", "runs/heaters-record-0-2", "runs/heaters-record-0-3"]
 
 
 def test_given_folder_must_not_exist(tmp_path):
