@@ -41,8 +41,8 @@ def choose(config: TrainConfig) -> Choice:
         return fitted(config, plant, [_of_models(params)], 0)
     if not plant.differentiable and config.pairs.rounds:
         record = tasks.options(config.plant, "record")
-        start = replace(config.pretraining, gradient_steps=record["pretraining.gradient_steps"])
-        pairs = replace(config.pairs, rounds=0)
+        steps = config.pretraining.gradient_steps or record["pretraining.gradient_steps"]
+        start, pairs = replace(config.pretraining, gradient_steps=steps), replace(config.pairs, rounds=0)
         return choose(replace(config, pairs=pairs, pretraining=start, correction=record.get("correction", 1.0)))
     if config.randomise:
         plant, params = plants.randomised(plant, params, config.randomise)
