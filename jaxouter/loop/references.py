@@ -223,7 +223,7 @@ class FamilyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Family:
-    """A trajectory of one of `FAMILIES`, drawn at each reset; its last value is held."""
+    """A trajectory of one of `FAMILIES`, or `redrawn`, drawn at each reset; its last value is held."""
 
     kind: str
     steps: int
@@ -233,7 +233,8 @@ class Family:
     def init(self, key: chex.PRNGKey, y0: jax.Array) -> tuple[FamilyState, jax.Array]:
         """A trajectory and its first value."""
         del y0
-        r = FAMILIES[self.kind](key, self.steps, self.low, self.high)
+        family = redrawn if self.kind == redrawn.__name__ else FAMILIES[self.kind]
+        r = family(key, self.steps, self.low, self.high)
         return FamilyState(r, jnp.zeros((), jnp.int32)), r[0]
 
     def step(self, state: FamilyState, y: jax.Array) -> tuple[FamilyState, jax.Array]:

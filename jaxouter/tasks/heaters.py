@@ -35,7 +35,6 @@ ROBUST = {
     **RECORD,
     "base": "static",
     "correction": 1.0,
-    "redraws": (0.0, 0.0),
     "pairs.rounds": 0,
     "compared": 0,
     "history": 20,

@@ -21,7 +21,6 @@ DEFAULT = {**RECORD, "reward.rest": 0.02}
 ROBUST = {
     "base": "static",
     "correction": 1.0,
-    "redraws": (0.0, 0.0),
     "pairs.rounds": 0,
     "compared": 0,
     "history": 80,  # longer than the longest delay

@@ -40,7 +40,6 @@ DEFAULT: Options = {
     **RECORD,
     "correction": 0.3,
     "reward.beta_h": 0.02,
-    "redraws": (1.0, 20.0),
     "pretraining.gradient_steps": 0,
     "pairs.rounds": 30,
 }

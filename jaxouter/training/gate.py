@@ -1,8 +1,8 @@
 """The gate: a new actor is kept only if it is better on fresh training episodes than the one before.
 
 Both meet the same episodes: starts, set-points, noise, loads and the plant's own randomness. The mean gain must be
-positive, and no stratum (moving or constant set-points, with or without noise and load) may lose more than the noise of
-its estimate: a gate on the mean alone would let a stratum decay.
+positive, and no stratum (set-points that stay, jump or move, with or without noise and load) may lose more than the
+noise of its estimate: a gate on the mean alone would let a stratum decay.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from jaxouter.loop.policy import LinearLaw
 from jaxouter.training.environments import step_with
 from jaxouter.training.policy import LearnedPolicy
 
-STRATA = 8
+STRATA = 12
+OFTEN = 0.25  # share of the steps in which r changes, above which it moves rather than jumps
 LOSS = 1.0  # standard errors that a stratum may lose
 
 
@@ -45,17 +46,18 @@ def reward_of(
     key_reset, key_run = jax.random.split(key)
     obs, state = env.reset(key_reset, params)
 
-    def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
+    def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, tuple[jax.Array, jax.Array]]:
         obs, state = carry
         obs, state, reward, _ = step_with(env, policy, base, params, state, policy.action(actor, obs), key)
-        return (obs, state), reward
+        return (obs, state), (reward, jnp.where(state.held == 0, 1.0, 0.0))
 
     keys = jax.random.split(key_run, env.plant.episode_steps)
-    (_, last), rewards = jax.lax.scan(step, (obs, state), keys)
-    flags = [last.held < last.k]
+    (_, last), (rewards, changes) = jax.lax.scan(step, (obs, state), keys)
+    changed = jnp.mean(changes)
+    stratum = jnp.where(changed > OFTEN, 2, jnp.where(changed > 0.0, 1, 0))
     if last.disturbance is not None:
-        flags += [last.disturbance.noise > 0.0, last.disturbance.load.size != 0.0]
-    return jnp.mean(rewards), sum((jnp.where(flag, 2**i, 0) for i, flag in enumerate(flags)), jnp.zeros((), int))
+        stratum += jnp.where(last.disturbance.noise > 0.0, 3, 0) + jnp.where(last.disturbance.load.size != 0.0, 6, 0)
+    return jnp.mean(rewards), stratum
 
 
 def compare(

@@ -110,7 +110,7 @@ class Improvement:
             noise = ornstein_uhlenbeck(noise, normal, THETA, sigma)
             action = jnp.clip(self.policy.action(actor, obs) + noise, -1.0, 1.0)
             obs, after, _, terminated = step_with(self.env, self.policy, base, params, state, action, key)
-            return (obs, after, noise, alive & ~terminated), (state, alive)
+            return (obs, after, noise, alive & ~terminated), (state._replace(goal=()), alive)
 
         begin = obs, state, jnp.zeros(()), jnp.ones((), bool)
         xs = jax.random.normal(key_noise, (steps,), float), jax.random.split(key_run, steps)

@@ -25,7 +25,7 @@ from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw, none, padded
-from jaxouter.loop.references import SetPoint
+from jaxouter.loop.references import Family, SetPoint
 from jaxouter.plants import make as make_plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
@@ -217,7 +217,8 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
     )
     learner = PairsLearner(config.pairs, config.agent.hidden, env.observer.size)
     compared = config.compared if plant.differentiable else min(config.compared, ON_HOST)
-    improvement = Improvement(env, environments.policy, agent, learner, environments.reward_scale, compared)
+    courses = replace(env, goal=Family("redrawn", plant.episode_steps, *plant.setpoint_range))
+    improvement = Improvement(courses, environments.policy, agent, learner, environments.reward_scale, compared)
     return Trainer(config, environments, driver(config, environments), improvement), params
 
 
