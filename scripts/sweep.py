@@ -27,15 +27,15 @@ from jaxouter.evaluation.policies import NamedPolicy, evaluate_on
 from jaxouter.training.run import RunFolder
 
 RESULTS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "learning.md"
-DDPG_ALONE = ("--pretraining.gradient-steps", "0", "--steps")
-THEN_DDPG = ("--steps", "38000", "--agent.actor-from", "2500")  # 7,500 updates; the actor moves in the last two thirds
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
-    "500-gradient-steps": ("--pretraining.gradient-steps", "500"),
-    "16-episodes": ("--pretraining.episodes", "16"),
-    "undisturbed": ("--disturbances.noise", "0", "--disturbances.load", "0"),
-    "then-ddpg-3e-6": (*THEN_DDPG, "--agent.actor-rate", "3e-6"),
-    "ddpg-alone": (*DDPG_ALONE, "128000"),
+    "scratch": ("--base", "static"),
+    "scratch-without-pairs": ("--base", "static", "--pairs.rounds", "0"),
+    "scratch-not-held": ("--base", "static", "--pairs.rounds", "0", "--agent.no-hold"),
+    "scratch-relabelled": ("--base", "static", "--pairs.rounds", "0", "--agent.relabel", "0.5"),
+    "record": ("--preset", "record"),
+    "record-16-episodes": ("--preset", "record", "--pretraining.episodes", "16"),
+    "record-undisturbed": ("--preset", "record", "--disturbances.noise", "0", "--disturbances.load", "0"),
 }
 
 
