@@ -16,6 +16,7 @@ from jaxouter.plants import Plant
 from jaxouter.training.config import PretrainingConfig, TrainConfig
 
 EXPLORATION = 3  # folded into a key
+ON_HOST = 4  # episodes on which actors are compared, on a plant that is simulated elsewhere
 
 
 class Choice(NamedTuple):
@@ -39,11 +40,8 @@ def choose(config: TrainConfig) -> Choice:
     plant, params = plants.make(config.plant)
     if plant.identified:
         return fitted(config, plant, [_of_models(params)], 0)
-    if not plant.differentiable and config.pairs.rounds:
-        record = tasks.options(config.plant, "record")
-        steps = config.pretraining.gradient_steps or record["pretraining.gradient_steps"]
-        start, pairs = replace(config.pretraining, gradient_steps=steps), replace(config.pairs, rounds=0)
-        return choose(replace(config, pairs=pairs, pretraining=start, correction=record.get("correction", 1.0)))
+    if not plant.differentiable:
+        config = _on_host(config)
     if config.randomise:
         plant, params = plants.randomised(plant, params, config.randomise)
     key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
@@ -59,6 +57,17 @@ def choose(config: TrainConfig) -> Choice:
         text = f"y of {plant.name} shows no effect of r~ above its noise in {steps:,} control steps; history stays"
         return Choice(replace(config, explored_steps=steps), None, (f"{text} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
+
+
+def _on_host(config: TrainConfig) -> TrainConfig:
+    """The configuration on a plant outside JAX: it can't be branched, and its episodes may be slow."""
+    config = replace(config, compared=min(config.compared, ON_HOST))
+    if not config.pairs.rounds:
+        return config
+    record = tasks.options(config.plant, "record")
+    steps = config.pretraining.gradient_steps or record["pretraining.gradient_steps"]
+    start, pairs = replace(config.pretraining, gradient_steps=steps), replace(config.pairs, rounds=0)
+    return replace(config, pairs=pairs, pretraining=start, correction=record.get("correction", 1.0))
 
 
 def _of_models(params: Any) -> Dynamics:

@@ -41,7 +41,6 @@ DIAGNOSIS = 2  # likewise
 BASE = 3  # likewise
 PAIRS = 4  # likewise
 CHECK = 5  # likewise
-ON_HOST = 4  # episodes of the check on a plant that is simulated elsewhere, and may be slow
 
 
 @dataclass(frozen=True)
@@ -216,9 +215,8 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         shards=shards,
     )
     learner = PairsLearner(config.pairs, config.agent.hidden, env.observer.size)
-    compared = config.compared if plant.differentiable else min(config.compared, ON_HOST)
     courses = replace(env, goal=Family("redrawn", plant.episode_steps, *plant.setpoint_range))
-    improvement = Improvement(courses, environments.policy, agent, learner, environments.reward_scale, compared)
+    improvement = Improvement(courses, environments.policy, agent, learner, environments.reward_scale, config.compared)
     return Trainer(config, environments, driver(config, environments), improvement), params
 
 
