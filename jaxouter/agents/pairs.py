@@ -34,6 +34,9 @@ class PairsConfig:
     """Pairs per round, at states of episodes with exploration."""
     environments: int = 64
     """These episodes."""
+    wander: bool = True
+    """Set-points of these episodes, and of those on which actors are compared, also walk and wander, as in the
+    pretraining; else they are as in the agent's own."""
     horizon: int = 40
     """Control steps of a pair."""
     change: float = 0.5

@@ -52,11 +52,12 @@ SCRATCH: Options = {
     "environments": 64,
     "epoch": 12_800,
     "agent.n_step": 5,
-    "agent.updates": 2,
+    "agent.updates": 3,
     "agent.prefill": 12_800,
     "agent.replay": 102_400,
     "agent.noise_sigma": (0.005, 0.03),
     "pairs.rounds": 30,
+    "pairs.wander": False,
     "pairs.change": 0.1,
     "pairs.noise_sigma": (0.005, 0.03),
 }

@@ -21,7 +21,6 @@ from jaxouter.training.gate import Comparison, compare
 from jaxouter.training.policy import LearnedPolicy
 
 GROWTH, CUT, LEAST = 1.3, 1 / 1.5, 1 / 32  # of the rate, where all of it is kept or not
-CHECKED = 2.0  # standard errors by which a stratum may be worse than under the base law alone
 THETA = 0.15  # of the exploration
 
 
@@ -68,7 +67,7 @@ class Improvement:
     def check(
         self, actor: Any, base: LinearLaw, params: EnvParams, key: chex.PRNGKey
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """The actor if it is better than none, else one whose action is zero: the base law alone.
+        """The actor if it is better than none by more than the error, else one whose action is zero: the base law.
 
         Returns:
             That actor, and metrics: kept (1 or 0); gain, error and worst over the base law, as for a round.
@@ -77,7 +76,7 @@ class Improvement:
         one = jax.tree.map(lambda leaf: leaf[None], actor)
         found = compare(self.env, self.policy, nothing, one, base, params, key, self.compared)
         found = Comparison(*(leaf[0] for leaf in found))
-        kept = (found.gain > 0.0) & (found.worst > -CHECKED)
+        kept = found.gain > found.error
         actor = jax.tree.map(lambda old, new: jnp.where(kept, old, new), actor, nothing)
         return actor, {"kept": jnp.where(kept, 1.0, 0.0), **found._asdict()}
 

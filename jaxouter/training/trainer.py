@@ -215,8 +215,9 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         shards=shards,
     )
     learner = PairsLearner(config.pairs, config.agent.hidden, env.observer.size)
-    courses = replace(env, goal=Family("redrawn", plant.episode_steps, *plant.setpoint_range))
-    improvement = Improvement(courses, environments.policy, agent, learner, environments.reward_scale, config.compared)
+    wandering = replace(env, goal=Family("redrawn", plant.episode_steps, *plant.setpoint_range))
+    on = wandering if config.pairs.wander else env
+    improvement = Improvement(on, environments.policy, agent, learner, environments.reward_scale, config.compared)
     return Trainer(config, environments, driver(config, environments), improvement), params
 
 
