@@ -198,27 +198,34 @@ def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: M
 
 
 def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapping[str, float], title: str) -> Figure:
-    """MAE without exploration, and reward with it, over environment steps, a line a seed.
+    """MAE over updates, a line a seed; beside it the reward with exploration, or what the gate let through.
 
     Args:
-        rows: of metrics.jsonl, by seed; `mae` and `reward` are drawn.
+        rows: of metrics.jsonl, by seed: `mae`, and `reward` of the agent's epochs, or else the `gain` of the rounds of
+            pairs in which a new actor was kept.
         levels: horizontal lines by name, such as the MAE of the static prefilter.
         title: what the MAE is of.
     """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
+    explored = any("reward" in row for of_seed in rows.values() for row in of_seed)
     for seed, of_seed in rows.items():
-        steps = [row["steps"] / 1000 for row in of_seed]
-        left.plot(steps, [row["mae"] for row in of_seed], lw=1.6, label=f"learned, seed {seed}")
-        right.plot(steps, [row.get("reward", math.nan) for row in of_seed], lw=1.6, label=f"seed {seed}")
+        updates = [row["updates"] / 1000 for row in of_seed]
+        left.plot(updates, [row["mae"] for row in of_seed], lw=1.6, label=f"learned, seed {seed}")
+        if explored:
+            gained = [row.get("reward", math.nan) for row in of_seed]
+        else:
+            rounds = [row["gain"] if row.get("kept") and "rate" in row else 0.0 for row in of_seed]
+            gained = np.cumsum(rounds).tolist()
+        right.plot(updates, gained, lw=1.6, label=f"seed {seed}")
     for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
         left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
     left.set_ylabel("MAE without exploration")
     log_axis(left, "y")
     left.set_title(title, fontsize=10, loc="left")
-    right.set_ylabel("reward a step, with exploration")
+    right.set_ylabel("reward a step, with exploration" if explored else "gain in reward a step, kept by the gate")
     for axes in (left, right):
-        axes.set_xlabel("environment steps [thousand]")
+        axes.set_xlabel("updates [thousand]")
         axes.legend(fontsize=7.5, framealpha=0.85)
     return styled(figure)
 

@@ -32,6 +32,13 @@ def test_the_houses_and_their_comfort_limit_are_drawn(houses, tmp_path):
 
 
 def test_a_learning_curve_has_a_line_a_seed_and_the_levels(tmp_path):
-    rows = [{"steps": 1000 * k, "mae": 3.0 / (k + 1), **({"reward": -1.0} if k else {})} for k in range(4)]
+    rows = [{"updates": 1000 * k, "mae": 3.0 / (k + 1), **({"reward": -1.0} if k else {})} for k in range(4)]
     path = figures.save(figures.learning_curve({0: rows, 1: rows}, {"static": 3.4}, "MAE"), tmp_path / "curve.png")
     assert path.stat().st_size > 10_000
+
+
+def test_a_learning_curve_of_pairs_shows_what_the_gate_let_through():
+    kept = [{"updates": 600 * k, "mae": 2.6, "gain": 0.5, "kept": k % 2, "rate": 1.0} for k in range(1, 4)]
+    check = {"updates": 1800, "mae": 2.6, "gain": 9.0, "kept": 1.0}
+    _, right = figures.learning_curve({0: [*kept, check]}, {}, "MAE").axes
+    np.testing.assert_array_equal(right.lines[0].get_ydata(), [0.5, 0.5, 1.0, 1.0])
