@@ -31,12 +31,12 @@ class PairsConfig:
     rounds: int = 0
     """Rounds; 0: none."""
     states: int = 8_192
-    """Pairs per round, at states of episodes with exploration."""
+    """Pairs per round, each at a state of an episode with exploration."""
     environments: int = 64
-    """These episodes."""
+    """Episodes with exploration per round."""
     wander: bool = True
-    """Set-points of these episodes, and of those on which actors are compared, also walk and wander, as in the
-    pretraining; else they are as in the agent's own."""
+    """In these episodes, and in those on which actors are compared, set-points also walk and wander, as in the
+    pretraining; else they are redrawn as in the agent's own episodes."""
     horizon: int = 40
     """Control steps of a pair."""
     change: float = 0.5
