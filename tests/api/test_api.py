@@ -18,6 +18,7 @@ import jaxouter
 from jaxouter import plants, train
 from jaxouter.api import Stopped, learning
 from jaxouter.evaluation import compare, evaluate, jobs
+from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.plants import registry
 from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.run import RunFolder
@@ -171,7 +172,7 @@ def test_mistakes_are_value_errors_that_say_what_is_allowed(given, text, tmp_pat
 @pytest.mark.slow
 def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
     run = jaxouter.learn(TERM, "quick", out=tmp_path / "run", progress=False, reward={"alpha_g": 0.6})
-    (row,), reward = run.metrics, run.summary.reward
+    row, reward = run.metrics[-1], run.summary.reward
     assert row["reward_gentle"] < 0.0
     assert (reward.trained["alpha_g"], reward.reported["alpha_g"], reward.terms) == (0.6, 0.3, ["gentle"])
     learned, none, *_ = run.summary.results
@@ -182,7 +183,8 @@ def test_a_reward_term_of_ones_own_is_trained_on_and_told_apart(tmp_path):
     terms = []
     for weight in (0.0, 1.0):
         price = replace(run.config.reward, terms=weight)
-        rollout = DifferentiableRollout.of(run.config.pretraining, trainer.env.plant, trainer.policy, 1, reward=price)
+        episodes = TrainingEpisodes(trainer.env.plant, reward=price)
+        rollout = DifferentiableRollout.of(run.config.pretraining, episodes, trainer.policy, 1)
         terms.append(rollout.mean_reward(run.policy.params, params.plant, jax.random.key(0)))
     assert terms[1] < terms[0]
 
