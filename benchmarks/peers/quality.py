@@ -55,13 +55,13 @@ class Watch(BaseCallback):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("library", choices=["stable-baselines3", "sbx"])
+    parser.add_argument("package", choices=["stable-baselines3", "sbx"])
     parser.add_argument("learner", choices=["DDPG", "TD3", "SAC"])
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--below", type=float, default=0.0, help="MAE at which to stop, crad (default: never)")
     parser.add_argument("--minutes", type=float, default=30.0, help="longest time (default: %(default)s)")
     options = parser.parse_args()
-    if options.library == "sbx":
+    if options.package == "sbx":
         import sbx as learners  # pyright: ignore[reportMissingImports]
     else:
         import stable_baselines3 as learners  # pyright: ignore[reportMissingImports]
