@@ -226,6 +226,10 @@ class OffPolicyAgent(Agent, Protocol):
         """The same learner for a loop without end; its actor is frozen for the first `warm_up` updates."""
         ...
 
+    def prepared(self, state: Any, obs: jax.Array) -> Any:
+        """The state before the first update, given the observations of the prefill (N, n). The policy is the same."""
+        ...
+
     def restarted(self, state: Any) -> Any:
         """The same networks, with fresh targets, optimisers and counters."""
         ...

@@ -17,6 +17,7 @@ from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
 from jaxouter.agents.networks import Actor, Critic, QuadraticCritic
 from jaxouter.agents.noise import ornstein_uhlenbeck
+from jaxouter.agents.whitening import Whitening
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,9 @@ class DDPGConfig(AgentConfig):
     but noise. An n-step return then ends where the set-point moves."""
     relabel: float = 0.0
     """Share of transitions that get another set-point, uniform in the plant's range; needs --agent.hold."""
+    whiten: float = 0.0
+    """Learn on whitened observations, as consecutive samples of y differ little; this is added, in squares, to each
+    standard deviation, for the sake of noise. 0: on plain ones."""
     noise_theta: float = 0.15
     """Mean reversion rate of the Ornstein-Uhlenbeck exploration noise; 1 is white noise."""
     noise_sigma: tuple[float, float] = (0.2, 0.2)
@@ -87,7 +91,7 @@ class DDPGConfig(AgentConfig):
     def check(self) -> None:
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
         positive = ("actor_rate", "critic_rate", "batch_size", "n_step", "policy_delay", "updates")
-        not_negative = ("critic_l2", "saturation_penalty", "actor_from", "target_noise", "target_noise_clip")
+        not_negative = ("critic_l2", "saturation_penalty", "actor_from", "target_noise", "target_noise_clip", "whiten")
         for field in positive:
             if not getattr(self, field) > 0:
                 raise ValueError(f"agent.{field} is {getattr(self, field)}; it must be positive")
@@ -140,6 +144,7 @@ class DDPGState(NamedTuple):
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
     updates: jax.Array  # int32
+    white: Any = ()  # the `Whitening` on which the networks learn, if any
 
 
 def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
@@ -221,9 +226,9 @@ class DDPG:
         obs, action = jnp.zeros(self.obs_size), jnp.zeros(self.action_size)
         actor = self.network.init(key_actor, obs)
         critics = tuple(self.critic.init(k, obs, action) for k in key_critics)
-        return self._begin(actor, critics)
+        return self._begin(actor, critics, Whitening.none(self.obs_size) if self.config.whiten else ())
 
-    def _begin(self, actor: Any, critics: tuple[Any, ...]) -> DDPGState:
+    def _begin(self, actor: Any, critics: tuple[Any, ...], white: Any) -> DDPGState:
         """These networks, with fresh targets, optimisers and counters."""
         return DDPGState(
             actor=actor,
@@ -233,18 +238,27 @@ class DDPG:
             actor_optimiser=self.actor_optimiser.init(actor),
             critic_optimiser=self.critic_optimiser.init(critics),
             updates=jnp.zeros((), jnp.int32),
+            white=white,
         )
+
+    def prepared(self, state: DDPGState, obs: jax.Array) -> DDPGState:
+        """The same policy, which will learn on observations that are whitened as these (N, n), if so configured."""
+        if not self.config.whiten:
+            return state
+        obs = obs if self.axis is None else jax.lax.all_gather(obs, self.axis, tiled=True)
+        return self.with_actor(state._replace(white=Whitening.of(obs, self.config.whiten)), self.actor(state))
 
     def restarted(self, state: DDPGState) -> DDPGState:
         """The same networks, with fresh targets, optimisers and counters."""
-        return self._begin(state.actor, state.critics)
+        return self._begin(state.actor, state.critics, state.white)
 
     def actor(self, state: DDPGState) -> Any:
-        """Parameters of the actor network."""
-        return state.actor
+        """Parameters of the actor network, on plain observations."""
+        return state.white.folded(state.actor) if self.config.whiten else state.actor
 
     def with_actor(self, state: DDPGState, actor: Any) -> DDPGState:
         """The state with another actor; its target network is replaced too."""
+        actor = state.white.unfolded(actor) if self.config.whiten else actor
         return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
 
     def endless(self, warm_up: int) -> DDPG:
@@ -264,7 +278,7 @@ class DDPG:
         """mu(s) plus Ornstein-Uhlenbeck noise that restarts with each episode; see `Agent.explore`."""
         sigma = noise.sigma * (1.0 + (self.config.noise_end - 1.0) * progress)
         x = ornstein_uhlenbeck(jnp.where(first, 0.0, noise.x), normal[0], self.config.noise_theta, sigma)
-        return jnp.clip(self.act(state.actor, obs) + x[None], -1.0, 1.0), noise._replace(x=x), ()
+        return jnp.clip(self.act(state.actor, self._seen(state, obs)) + x[None], -1.0, 1.0), noise._replace(x=x), ()
 
     def act(self, actor: Any, obs: jax.Array) -> jax.Array:
         """mu(s): obs (..., n) -> action (..., m) in [-1, 1]."""
@@ -276,7 +290,12 @@ class DDPG:
 
     def value(self, state: DDPGState, obs: jax.Array) -> jax.Array:
         """Q(s, mu(s)) of the first critic: obs (..., n) -> (...)."""
+        obs = self._seen(state, obs)
         return cast(jax.Array, self.critic.apply(state.critics[0], obs, self.act(state.actor, obs)))
+
+    def _seen(self, state: DDPGState, obs: jax.Array) -> jax.Array:
+        """Observations as the networks take them: (..., n) -> (..., n)."""
+        return state.white(obs) if self.config.whiten else obs
 
     def values(self, critics: tuple[Any, ...], obs: jax.Array, action: jax.Array) -> jax.Array:
         """Q of each critic: (B, n), (B, m) -> (B, critics)."""
@@ -306,6 +325,7 @@ class DDPG:
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
+        batch = batch._replace(obs=self._seen(state, batch.obs), next_obs=self._seen(state, batch.next_obs))
         next_action = self.act(state.target_actor, batch.next_obs)
         if cfg.target_noise > 0:
             noise = cfg.target_noise * jax.random.normal(key, next_action.shape, next_action.dtype)

@@ -135,7 +135,7 @@ class PairsLearner:
             actor_optimiser=adam(self.config.actor_rate).init(actor),
             pairs=Pairs(jnp.zeros((size, self.obs_size)), nothing, nothing, nothing),
             scale=jnp.ones(()),
-            white=Whitening(jnp.zeros(self.obs_size), jnp.eye(self.obs_size)),
+            white=Whitening.none(self.obs_size),
             rate=jnp.ones(()),
             rounds=jnp.zeros((), jnp.int32),
         )

@@ -21,14 +21,19 @@ class Whitening(NamedTuple):
     matrix: jax.Array  # (n, n), symmetric
 
     @classmethod
-    def of(cls, obs: jax.Array) -> Whitening:
-        """The whitening of observations like these (N, n)."""
+    def none(cls, n: int) -> Whitening:
+        """Observations as they are."""
+        return cls(jnp.zeros(n), jnp.eye(n))
+
+    @classmethod
+    def of(cls, obs: jax.Array, floor: float = FLOOR) -> Whitening:
+        """The whitening of observations like these (N, n); `floor` is added to each standard deviation, in squares."""
         variance, axes = jnp.linalg.eigh(jnp.cov(obs, rowvar=False))
-        return cls(obs.mean(0), (axes / jnp.sqrt(jnp.maximum(variance, 0.0) + FLOOR**2)[None]) @ axes.T)
+        return cls(obs.mean(0), (axes / jnp.sqrt(jnp.maximum(variance, 0.0) + floor**2)[None]) @ axes.T)
 
     def __call__(self, obs: jax.Array) -> jax.Array:
-        """Whitened observations (N, n)."""
-        return (obs - self.mean[None]) @ self.matrix
+        """Whitened observations (..., n)."""
+        return (obs - jnp.broadcast_to(self.mean, obs.shape)) @ self.matrix
 
     def folded(self, actor: Any) -> Any:
         """The actor on plain observations, from one whose first layer takes whitened ones."""

@@ -152,13 +152,23 @@ def _of_set_points(traces: Traces, plant: Plant) -> dict[str, Any]:
     return found
 
 
+def share_outside(traces: Traces, plant: Plant) -> float:
+    """Share of the steps in which y or its change is outside the plant's limits."""
+    return float(np.mean(_excess(traces, plant) > ROUNDING * plant.error_scale))
+
+
+def _excess(traces: Traces, plant: Plant) -> np.ndarray:
+    return np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
+
+
 def _violations(traces: Traces, plant: Plant) -> dict[str, Any]:
     """Time and size outside the limits of y or of its change, where there are any."""
     if plant.output_limit is None and plant.rate_limit is None:
         return {}
-    over = np.asarray(excess(plant, traces.y, np.concatenate([traces.y0[:, None], traces.y[:, :-1]], 1)))
-    outside = over > ROUNDING * plant.error_scale
-    found = {"violation_time": float(outside.mean()), "violation_max": float(max(0.0, over.max()))}
+    found = {
+        "violation_time": share_outside(traces, plant),
+        "violation_max": float(max(0.0, _excess(traces, plant).max())),
+    }
     if plant.members is not None:
         found["violation_time_each"] = float(traces.each_outside.mean())
         found["violation_max_each"] = float(max(0.0, traces.each_excess.max()))

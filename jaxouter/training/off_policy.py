@@ -134,11 +134,12 @@ class OffPolicyDriver:
         held = jax.lax.cummax(jnp.where(redraw, jnp.arange(steps)[:, None], 0))  # the step of the last redraw
         actions = jnp.take_along_axis(fresh, held, 0)
 
-        def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, None]:
-            state, taken = every.step(state, params, *xs)
-            return state._replace(data=self.replay.write(state.data, self.row(taken))), None
+        def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, jax.Array]:
+            after, taken = every.step(state, params, *xs)
+            return after._replace(data=self.replay.write(after.data, self.row(taken))), state.obs
 
-        return jax.lax.scan(step, state, (actions, every.each(keys_env)))[0]
+        state, obs = jax.lax.scan(step, state, (actions, every.each(keys_env)))
+        return state._replace(agent=self.agent.prepared(state.agent, obs.reshape(-1, obs.shape[-1])))
 
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Explore and learn for `steps` environment steps (over all environments of all shards).

@@ -56,7 +56,7 @@ def resources(config: TrainConfig) -> Resources:
     whole = _size(state)
     lines = [
         ("observation", f"{observer.size} numbers: r, r - y, integral, {observer.history} past y, as many past r~"),
-        ("actor", f"{widths}, {_count(trainer.agent.actor(state.agent)):,} parameters"),
+        ("actor", f"{widths}, {_count(jax.eval_shape(trainer.agent.actor, state.agent)):,} parameters"),
         ("agent", f"{_count(state.agent):,} numbers: networks, targets, optimisers"),
     ]
     if isinstance(trainer.driver, OffPolicyDriver):

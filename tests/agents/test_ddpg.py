@@ -245,3 +245,45 @@ def test_defaults_are_the_papers():
     cfg = DDPGConfig()
     assert (cfg.hidden, cfg.actor_rate, cfg.critic_rate, cfg.discount) == ((400, 300), 1e-4, 1e-3, 0.99)
     assert (cfg.polyak, cfg.batch_size, cfg.critics, cfg.policy_delay, cfg.target_noise) == (0.001, 64, 1, 1, 0.0)
+
+
+def alike(seed: int, size: int) -> jax.Array:
+    """Observations whose parts differ little from each other, as consecutive samples do."""
+    one, rest = jax.random.normal(jax.random.key(seed), (2, size, 3))
+    return one[:, :1] + 0.05 * rest + 1.0
+
+
+def test_whitening_leaves_the_policy_as_it_is():
+    ddpg = DDPG(replace(SMALL, whiten=1e-2), 3)
+    before, obs = ddpg.init(jax.random.key(0)), alike(1, 500)
+    state = ddpg.prepared(before, obs)
+    np.testing.assert_allclose(np.cov(state.white(obs).T), np.eye(3), atol=0.1)
+    expected = ddpg.act(ddpg.actor(before), obs)
+    np.testing.assert_allclose(ddpg.act(ddpg.actor(state), obs), expected, atol=1e-5)
+    action, *_ = ddpg.explore(state, ddpg.noise(1)._replace(x=0.0, sigma=0.0), obs[0], jnp.zeros(1), False, 0.0)
+    np.testing.assert_allclose(action, expected[0], atol=1e-5)
+    again = ddpg.with_actor(state, ddpg.actor(state))
+    chex.assert_trees_all_close(again.actor, state.actor, atol=1e-4)
+
+
+def test_a_whitened_learner_learns_what_a_plain_one_learns_on_whitened_observations():
+    whitened, plain = DDPG(replace(SMALL, whiten=1e-2), 3), DDPG(SMALL, 3)
+    batch = random_batch(3)._replace(obs=alike(4, 8), next_obs=alike(5, 8))
+    state = whitened.prepared(whitened.init(jax.random.key(0)), alike(1, 500))
+    white, other = state.white, state._replace(white=())
+    of_plain = batch._replace(obs=white(batch.obs), next_obs=white(batch.next_obs))
+    update, of_other = jax.jit(whitened.update), jax.jit(plain.update)
+    for _ in range(3):
+        state, metrics = update(state, batch, jax.random.key(2))
+        other, expected = of_other(other, of_plain, jax.random.key(2))
+        chex.assert_trees_all_close(metrics, expected, rtol=1e-5)
+    chex.assert_trees_all_close(state._replace(white=()), other, rtol=1e-5)
+    obs = alike(6, 20)
+    np.testing.assert_allclose(whitened.act(whitened.actor(state), obs), plain.act(other.actor, white(obs)), atol=1e-5)
+    np.testing.assert_allclose(whitened.value(state, obs), plain.value(other, white(obs)), atol=1e-5)
+
+
+def test_without_whitening_nothing_is_prepared():
+    ddpg = DDPG(SMALL, 3)
+    state = ddpg.init(jax.random.key(0))
+    assert ddpg.prepared(state, jnp.ones((5, 3))) is state

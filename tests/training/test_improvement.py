@@ -1,5 +1,6 @@
 """Rounds of improvement by pairs, and the gate."""
 
+import sys
 from dataclasses import replace
 
 import chex
@@ -103,3 +104,24 @@ def test_candidates_that_lose_in_the_mean_or_in_a_stratum_are_refused():
     assert float(found.gain[2]) > float(found.gain[0])
     assert float(found.worst[2]) == pytest.approx(-10.0, abs=2.5)  # 0.1 of an error of 0.1 / sqrt(100)
     np.testing.assert_allclose(found.error[0], 0.1 / 20, rtol=0.1)
+
+
+def test_from_scratch_nothing_is_identified_but_the_static_gain(monkeypatch):
+    def identifies(*args, **settings):
+        raise AssertionError("a model was identified")
+
+    allowed = "jaxouter.identification.steady_state"
+    for module in [module for name, module in sys.modules.items() if name.startswith("jaxouter")]:
+        for name, value in list(vars(module).items()):
+            of = getattr(value, "__module__", None) or ""
+            if of.startswith("jaxouter.identification") and of != allowed and not isinstance(value, type):
+                monkeypatch.setattr(module, name, identifies)
+    trainer, params = build(small(name="scratch", base="static", pairs=PAIRS, compared=128, redraws=(1.0, 20.0)))
+    state = trainer.prefill(jax.tree.map(jnp.copy, trainer.start(0, params)), params)
+    state, _ = trainer.epoch(state, params, trainer.config.epoch)
+    state, metrics = trainer.improve(state, params)
+    state, _ = trainer.check(state, params)
+    assert int(state.agent.updates) > 0
+    assert np.isfinite(metrics["pairs_loss"])
+    with pytest.raises(AssertionError, match="identified"):
+        build(replace(trainer.config, base="lq"))[0].start(0, params)

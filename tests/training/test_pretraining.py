@@ -66,8 +66,8 @@ def test_the_same_seed_gives_the_same_actor(config):
 
 @pytest.mark.slow
 def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
-    start = replace(START, episodes=32, plants=8, noise=0.02, load=0.05)
-    trainer, params = build(replace(config, randomise=(("K", 0.3, 0.7), ("T", 0.2, 0.4)), pretraining=start))
+    drawn = dict(randomise=(("K", 0.3, 0.7), ("T", 0.2, 0.4)), disturbances=Disturbances(noise=0.02, load=0.05))
+    trainer, params = build(replace(config, pretraining=replace(START, episodes=32, plants=8), **drawn))
     state = trainer.start(0, params)
     episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
     assert float(np.ptp(episodes.params.K)) > 0.3

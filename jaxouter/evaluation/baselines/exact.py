@@ -1,7 +1,8 @@
 """`lq-exact` and `mpc-exact`: the LQ law and MPC of the true plant. With `oracle` they are the limit.
 
 Nothing about the plant is hidden when they are made: the model is that of the plant without noise, and they are tuned
-on the plant itself, by the MAE. In operation they see r and y alone, without preview.
+on the plant itself, by the MAE among those that stay within the plant's limits nearly as often as the static
+prefilter. In operation they see r and y alone, without preview.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import numpy as np
 from jaxouter.evaluation.baselines import lq, mpc
 from jaxouter.evaluation.baselines.tuning import Report, learner, learners_episodes
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.evaluation.metrics import mae
+from jaxouter.evaluation.metrics import mae, share_outside
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification import dynamics, steady_state
-from jaxouter.identification.lq import Choice, choose
+from jaxouter.identification.lq import WITHIN, Choice, choose
 from jaxouter.identification.records import record, within
 from jaxouter.plants import Plant
 
@@ -45,13 +46,18 @@ def tune_lq(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: R
 
 def tune_mpc(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
     """As `mpc`, but for the model and the MAE; `budget` bounds the settings that are tried."""
-    key_record, key_episodes = jax.random.split(key)
+    key_record, key_episodes, key_static = jax.random.split(key, 3)
     clean = within(record(plant, plant.noise_free(params), key_record, RECORD), plant.divergence_bounds)
     report("identifying its model", 0.0)
     episodes = learners_episodes(plant, params, key_episodes)
 
+    static = steady_state.static(plant, params, key_static)
+    allowed = share_outside(rollout(*static, episodes), plant) + WITHIN
+
     def score(controller: mpc.MPC) -> float:
-        error = mae(rollout(controller, (), episodes))
-        return -error if np.isfinite(error) else -np.inf
+        traces = rollout(controller, (), episodes)
+        more = max(0.0, share_outside(traces, plant) - allowed)
+        cost = mae(traces) + more * float(np.ptp(plant.setpoint_range))
+        return -cost if np.isfinite(cost) else -np.inf
 
     return mpc.tuned(plant, clean, score, budget, episodes.r.size, report)
