@@ -79,7 +79,8 @@ def judged(run: Path, out: str) -> None:
     values = verdict["mae"]
     learned = values["learned"]["0"]
     others = [value for name, value in values.items() if name != "learned" and value is not None]
-    assert verdict["worse"] == ([] if learned is not None and learned <= min(others) else [0])
+    if learned is None or not min(others) < learned < 1.1 * min(others):  # else it depends on chance
+        assert verdict["worse"] == ([] if learned is not None and learned <= min(others) else [0])
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 ON_HOST = 4  # episodes of a plant that is simulated elsewhere, and may be slow
+ERRORS = 2.0  # standard errors of the mean difference, from which on a policy is worse than another
 
 
 class Verdict(Struct, frozen=True):
@@ -27,7 +28,7 @@ class Verdict(Struct, frozen=True):
 
     episodes: int
     mae: dict[str, float | dict[str, float | None] | None]  # by name, `learned` by seed; None where diverged
-    worse: list[int]  # seeds that are not the best
+    worse: list[int]  # seeds that are worse than the best of the others
     text: str  # for people
 
 
@@ -52,15 +53,16 @@ def judge(
         jnp.zeros_like, next(iter(learned.values())).actor
     )  # its action is zero: what is left is affine
 
-    def of(policy_params: LearnedParams) -> float:
+    def of(policy_params: LearnedParams) -> np.ndarray:
         strong = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), policy_params)  # else compiled for anew
-        value = float(_mean_error(plant, policy, count, params, strong, key))
-        return value if np.isfinite(value) else np.inf
+        errors = np.asarray(_errors(plant, policy, count, params, strong, key), np.float64)
+        return np.where(np.isfinite(errors), errors, np.inf)
 
-    found = {name: of(LearnedParams(idle, affine)) for name, affine in simple.items()}
-    of_seeds = {seed: of(each) for seed, each in learned.items()}
+    errors = {name: of(LearnedParams(idle, affine)) for name, affine in simple.items()}
+    by = {seed: of(each) for seed, each in learned.items()}
+    found, of_seeds = ({name: float(each.mean()) for name, each in of_all.items()} for of_all in (errors, by))
     best = min(found, key=lambda name: found[name])
-    worse = [seed for seed, value in of_seeds.items() if not value <= found[best] or np.isinf(value)]
+    worse = [seed for seed, each in by.items() if _is_worse(each, errors[best])]
     mae = {name: _finite(value) for name, value in found.items()}
     by_seed = {str(seed): _finite(value) for seed, value in of_seeds.items()}
     text = _text(found, of_seeds, best, worse, count, plant.y_unit)
@@ -68,11 +70,21 @@ def judge(
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=RUN_ONCE)
-def _mean_error(
+def _errors(
     plant: Plant, policy: LearnedPolicy, count: int, params: Any, policy_params: LearnedParams, key: chex.PRNGKey
 ) -> jax.Array:
+    """MAE of each episode."""
     episodes = training_episodes(plant, params, key, count)
-    return jnp.mean(jnp.abs(episodes.r - outputs(policy, policy_params, episodes)))
+    return jnp.mean(jnp.abs(episodes.r - outputs(policy, policy_params, episodes)), 1)
+
+
+def _is_worse(errors: np.ndarray, others: np.ndarray) -> bool:
+    """Whether a policy is worse than another on the same episodes, by more than so few of them differ by chance."""
+    diverged, other_diverged = (not np.isfinite(each).all() for each in (errors, others))
+    if diverged or other_diverged:
+        return diverged
+    more = errors - others
+    return bool(more.mean() > ERRORS * more.std() / len(more) ** 0.5)
 
 
 def _finite(value: float) -> float | None:
@@ -90,7 +102,9 @@ def _text(
     ours = ", ".join(told(of_seeds[seed]) for seed in (worse or of_seeds))
     on = f"on {count} fresh training episodes"
     if not worse:
-        return f"verdict: {on} what was learned is the best; MAE{unit}: learned {ours}, {others}"
+        best_of_all = max(of_seeds.values()) <= found[best]
+        what = "the best" if best_of_all else f"no worse than {best}, as far as so few tell"
+        return f"verdict: {on} what was learned is {what}; MAE{unit}: learned {ours}, {others}"
     which = "" if len(of_seeds) == 1 else f" by seed {', '.join(map(str, worse))}"
     return (
         f"verdict: {on} what was learned{which} is worse than {best}; MAE{unit}: learned {ours}, {others}. Use {best} "

@@ -52,6 +52,7 @@ SCRATCH: Options = {
     "environments": 64,
     "epoch": 12_800,
     "agent.n_step": 5,
+    "agent.whiten": 0.2,
     "agent.updates": 3,
     "agent.prefill": 12_800,
     "agent.replay": 102_400,

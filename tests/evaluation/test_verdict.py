@@ -9,11 +9,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import msgspec
+import numpy as np
 import pytest
 
 from jaxouter import plants
 from jaxouter.api import Run
-from jaxouter.evaluation.verdict import Verdict, judge
+from jaxouter.evaluation.verdict import Verdict, _is_worse, judge
 from jaxouter.loop.policy import LinearLaw
 from jaxouter.loop.policy import affine as linear
 from jaxouter.training.policy import LearnedParams
@@ -59,6 +60,12 @@ def test_what_is_worse_than_doing_nothing_is_named_by_seed() -> None:
     assert "what was learned by seed 4 is worse than static; MAE: learned" in found.text
     assert "export asks for --force" in found.text
     json.dumps(msgspec.to_builtins(found), allow_nan=False)
+
+
+@pytest.mark.parametrize(("more", "expected"), [([0.3, -0.3, 0.2, -0.1], False), ([0.1, 0.1, 0.2, 0.1], True)])
+def test_what_chance_may_have_done_is_not_said_to_be_worse(more: list[float], expected: bool) -> None:
+    assert _is_worse(1.0 + np.array(more), np.ones(4)) == expected
+    assert not _is_worse(np.ones(4), np.full(4, np.inf))
 
 
 def test_what_diverges_is_worse() -> None:
