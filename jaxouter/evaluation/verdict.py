@@ -60,7 +60,8 @@ def judge(
 
     errors = {name: of(LearnedParams(idle, affine)) for name, affine in simple.items()}
     by = {seed: of(each) for seed, each in learned.items()}
-    found, of_seeds = ({name: float(each.mean()) for name, each in of_all.items()} for of_all in (errors, by))
+    found = {name: float(each.mean()) for name, each in errors.items()}
+    of_seeds = {seed: float(each.mean()) for seed, each in by.items()}
     best = min(found, key=lambda name: found[name])
     worse = [seed for seed, each in by.items() if _is_worse(each, errors[best])]
     mae = {name: _finite(value) for name, value in found.items()}
