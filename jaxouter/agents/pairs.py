@@ -3,7 +3,7 @@
 Near a good policy the error of a value function dwarfs what a better action gains, so its gradient leads nowhere. A
 pair is one state with the same noise, load and set-point, once under the policy and once with its first action changed;
 the difference of the two discounted returns holds no such error. The critic learns it as a concave function of the
-change, and the actor follows the critic's gradient, as in DDPG.
+change, and the actor follows the critic's gradient.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def learn(
         out: new folder for the run; None: runs/PLANT-PRESET-SEED.
         progress: whether to show progress.
         agent: None: the preset's; another one by name, or FILE.py:CLASS. Settings such as `{"discount": 0.9}` are of
-            the preset's, or of the agent that is named among them: `{"name": "ddpg", "discount": 0.9}`.
+            the preset's, or of the agent that is named among them: `{"name": NAME, "discount": 0.9}`.
         set: parameters of the plant, such as `{"tau": 0.7}`.
         episodes: of each scenario in the evaluation; None: the scenario's own number.
         tensorboard: whether to write TensorBoard events too.
