@@ -95,6 +95,6 @@ def Saturating(*, kp: float = 1.0, ki: float = 2.0, limit: float = 1.2) -> Any: 
     return _made("Saturating", kp=kp, ki=ki, dead_band=0.0, limit=limit, rate=100.0)
 
 
-def RateLimited(*, kp: float = 1.0, ki: float = 2.0, rate: float = 0.5) -> Any:  # noqa: N802
+def RateLimited(*, kp: float = 1.0, ki: float = 1.0, rate: float = 0.5) -> Any:  # noqa: N802
     """The actuator moves slowly."""
     return _made("RateLimited", kp=kp, ki=ki, dead_band=0.0, limit=10.0, rate=rate)
