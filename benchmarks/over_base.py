@@ -100,6 +100,19 @@ def table(name: str, found: Mapping[str, Any]) -> Iterator[str]:
         yield f"| {name} | {scenario} | {cells} | {100 * (after / before - 1):+.1f} % |"
 
 
+def written(known: Mapping[str, Any]) -> str:
+    """Both tables."""
+    lines = ["| loop | scenario | `static` | `lq` | before DDPG | `default` | DDPG |", "|---|---|---|---|---|---|---|"]
+    lines += [row for name, found in known.items() for row in table(name, found)]
+    lines += ["", "Gain of DDPG in return on fresh training episodes, in percent:", ""]
+    lines += ["| loop | seeds | least | median | greatest | date |", "|---|---|---|---|---|---|"]
+    for name, found in known.items():
+        gains = [100 * each for each in found["gain"]]
+        numbers = f"{min(gains):+.2f} | {median(gains):+.2f} | {max(gains):+.2f}"
+        lines.append(f"| {name} | {len(gains)} | {numbers} | {found['date']} |")
+    return "\n".join([*lines, "", "`python benchmarks/over_base.py`; MAE: medians over the seeds."])
+
+
 def main(loops: tyro.conf.Positional[tuple[str, ...]] = tuple(LOOPS), seeds: int = 20) -> None:
     """The command.
 
@@ -111,19 +124,11 @@ def main(loops: tyro.conf.Positional[tuple[str, ...]] = tuple(LOOPS), seeds: int
     known = json.loads(path.read_text())["loops"] if path.exists() else {}
     for name in loops:
         with tempfile.TemporaryDirectory() as folder:
-            known[name] = measured(name, seeds, Path(folder))
-        print(*table(name, known[name]), f"least gain {100 * min(known[name]['gain']):.2f} %", sep="\n", flush=True)
-    write_json(path, {"date": date.today().isoformat(), "machine": surroundings(), "loops": known})
-    lines = ["| loop | scenario | `static` | `lq` | before DDPG | `default` | DDPG |", "|---|---|---|---|---|---|---|"]
-    lines += [row for name, found in known.items() for row in table(name, found)]
-    lines += ["", "Gain of DDPG in return on fresh training episodes, in percent:", ""]
-    lines += ["| loop | seeds | least | median | greatest |", "|---|---|---|---|---|"]
-    for name, found in known.items():
-        gains = [100 * each for each in found["gain"]]
-        lines.append(f"| {name} | {len(gains)} | {min(gains):+.2f} | {median(gains):+.2f} | {max(gains):+.2f} |")
-    text = "\n".join([*lines, "", f"`python benchmarks/over_base.py`, {date.today().isoformat()}, MAE: medians."])
-    (RESULTS / "over-base.md").write_text(text + "\n")
-    print(text)
+            known[name] = measured(name, seeds, Path(folder)) | {"date": date.today().isoformat()}
+        write_json(path, {"machine": surroundings(), "loops": known})
+        text = written(known)
+        (RESULTS / "over-base.md").write_text(text + "\n")
+        print(text, flush=True)
 
 
 if __name__ == "__main__":
