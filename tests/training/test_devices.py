@@ -108,7 +108,7 @@ def started(folder: Path, *options: list[str]) -> Iterator[list[subprocess.Popen
 def ended(processes: list[subprocess.Popen[str]]) -> list[int]:
     """Exit codes; where one is not expected, pytest shows what was printed."""
     for process in processes:
-        print(process.communicate(timeout=200)[0])
+        print(process.communicate(timeout=600)[0])
     return [process.returncode for process in processes]
 
 
@@ -121,14 +121,14 @@ def pair() -> list[list[str]]:
     return [[*common, str(i)] for i in range(2)]
 
 
-@pytest.mark.timeout(500)
+@pytest.mark.timeout(1500)
 @of_single_draws
 @pytest.mark.slow
 def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
     """50 updates; the two processes are stopped through the second one, and resumed."""
     train = ["heaters", *OPTIONS, "--devices", "2", "--out"]
     with started(tmp_path, *([*train, "apart", *which] for which in pair())) as processes:
-        metrics, deadline = tmp_path / "apart" / "seed-0" / "metrics.jsonl", time.monotonic() + 200
+        metrics, deadline = tmp_path / "apart" / "seed-0" / "metrics.jsonl", time.monotonic() + 600
         while not (metrics.exists() and metrics.read_text()) and time.monotonic() < deadline:
             time.sleep(0.02)
         processes[1].send_signal(signal.SIGINT)
