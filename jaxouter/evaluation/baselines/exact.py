@@ -1,8 +1,8 @@
 """`lq-exact` and `mpc-exact`: the LQ law and MPC of the true plant. With `oracle` they are the limit.
 
 Nothing about the plant is hidden when they are made: the model is that of the plant without noise, and they are tuned
-on the plant itself, by the MAE among those that stay within the plant's limits nearly as often as the static
-prefilter. In operation they see r and y alone, without preview.
+on the plant itself, by the MAE; leaving the plant's limits more often than the static prefilter has a price. In
+operation they see r and y alone, without preview.
 """
 
 from __future__ import annotations
