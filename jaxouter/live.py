@@ -35,8 +35,9 @@ class Options:
     """Run an outer loop around your function step(r~) -> y, once every DT seconds, and optionally learn online.
 
     If RUN is a trained run, its policy acts. Otherwise --learn starts without one: r passes through while a record is
-    made, then the static inverse acts. The learned policy takes over once it is predicted to be better, and is replaced
-    again if it turns out worse. If a deadline is missed, r passes through for that step.
+    made, then the static inverse acts, later an LQ law. What is learned takes over only where it is predicted to be
+    better on the same steps, and is sent back if it turns out worse. If a deadline is missed, r passes through for that
+    step.
 
     State, one row per step, a summary and a figure are written to RUN/live. Ctrl-C stops and saves; the same command
     resumes.
@@ -194,6 +195,9 @@ def report(folder: LiveFolder, loop: Loop) -> None:
         f"{found['steps']:,} steps ({passed}); {found['missed_deadlines']:,} missed deadlines; {found['updates']:,} "
         f"updates; act takes {act['p50']:.0f} us (p50), {act['p99']:.0f} us (p99)"
     )
+    if found["updates"]:
+        accepted, refused, back = (found[name] for name in ("accepted", "refused", "sent_back"))
+        print(f"learned policies: {accepted:,} accepted, {refused:,} refused, {back:,} sent back")
     with optional("figure"):
         print(f"figure: {figures.save(figures.live(columns, unit), folder.path / 'live.png')}")
     print(f"summary, steps.csv and controller.npz: {folder.path}")

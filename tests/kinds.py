@@ -100,3 +100,4 @@ Nonminimum = kind([1.6, -0.63], [-0.03, 0.045])  # poles 0.9 and 0.7, zero at 1.
 Late = late(30)  # nearly a third of an episode
 Integrating = kind([1.0], [0.04])
 Unstable = kind([1.04], [0.04])
+AtOnce = kind([0.0], [1.0])  # y is r~ at the next step

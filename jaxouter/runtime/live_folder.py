@@ -155,7 +155,7 @@ class LiveFolder:
         checkpoint.save(self.state_file, state)
         if state.begun:
             live = loop.live
-            actor = live.agent.actor(state.agent) if state.leads else state.kept
+            actor = state.incumbent if state.leads else state.kept
             policy, params = live.policy.trimmed(LearnedParams(actor, state.base))
             spec = ControllerSpec.of(policy, params, live.env.plant)
             spec.save(self.path / "controller.npz")
@@ -238,7 +238,7 @@ def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Results of the loop so far; needs at least one step.
 
     The MAE is given for the loop itself and, on the same steps, for the compared policies as predicted from the record.
-    `act_us` and `sent_back` are since the start of this process.
+    `act_us`, `accepted`, `refused` and `sent_back` are since the start of this process.
     """
     p50, p99 = np.percentile(1e6 * np.asarray(loop.act_seconds), (50, 99)).tolist()
     law = loop.state.base
@@ -248,6 +248,8 @@ def summary(loop: Loop, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "missed_deadlines": loop.counts["late"],
         "counts": loop.counts,
         "updates": loop.updates,
+        "accepted": loop.accepted,
+        "refused": loop.refused,
         "sent_back": loop.sent_back,
         "act_us": {"p50": p50, "p99": p99},
         "base": {name: np.asarray(value).tolist() for name, value in law._asdict().items()},

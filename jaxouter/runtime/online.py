@@ -5,8 +5,8 @@ acts, then the LQ law of a longer record, and later the policy learned on top of
 at first, and later what it has learned since. `jaxouter.runtime.realtime` is the loop in time.
 
 Once the response of y to a change of r~ is known, each step is replayed under other r~
-(`jaxouter.identification.counterfactual`), at no cost to the plant. Three of these replays predict what passing r
-through, the fallback and the learned policy would have achieved; the rest explore.
+(`jaxouter.identification.counterfactual`), at no cost to the plant. Four of these replays predict what passing r
+through, the fallback, the policy that acts and a candidate for its place would have achieved; the rest explore.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FOLLOWS = Model(np.zeros(1), np.ones(1), np.zeros(()), np.zeros(()))  # y = r~ a
 HISTORY = 8  # past samples in the observation of an unknown plant
 LAGS = 15  # past samples in its LQ law
 NOISE, PRICES = 0.02, (0.1, 0.3, 1.0, 3.0, 10.0)  # of the LQ law, see `identification.lq`; the first that comes to rest
-COMPARED = 3  # counterfactuals that are compared: r passed through, the fallback, the learned policy (no exploration)
+COMPARED = 4  # counterfactuals without exploration: r passed through, the fallback, the incumbent, the candidate
 EXPLORING = 12  # counterfactuals that explore
 SIGMA, THETA = (0.0125, 0.1), 0.15  # Ornstein-Uhlenbeck noise; sigma of the loop itself and of the last counterfactual
 REDRAW = 0.02  # probability per step that an exploring counterfactual gets a new set-point
@@ -96,8 +96,10 @@ class LiveState(NamedTuple):
     replay: ReplayState
     base: LinearLaw  # r~ of a zero action
     kept: Any  # fallback actor, from the start; if it is zero, the fallback is the static inverse
+    incumbent: Any  # learned actor that acts if `leads`
+    candidate: Any  # actor that is judged: the agent's, some steps ago
     begun: jax.Array  # bool, whether a base law is known (else r~ = r)
-    leads: jax.Array  # bool, whether the learned policy acts
+    leads: jax.Array  # bool, whether a learned policy acts
     response: Response
     sample: Sample  # of the last step
     others: Others
@@ -155,11 +157,14 @@ class Live:
         key, key_agent = jax.random.split(key)
         zero, middle = jnp.zeros(()), jnp.asarray(self.observer.y_middle, float)
         sample, agent = self.first(middle, middle), self.agent.init(key_agent)
+        nothing = jax.tree.map(jnp.zeros_like, self.agent.actor(agent))
         return LiveState(
             agent=agent,
             replay=self.replay.init(),
             base=affine(1.0, 0.0, self.observer.lags),
-            kept=jax.tree.map(jnp.zeros_like, self.agent.actor(agent)),
+            kept=nothing,
+            incumbent=nothing,
+            candidate=nothing,
             begun=jnp.zeros((), bool),
             leads=jnp.zeros((), bool),
             response=Response(jnp.zeros(self.observer.history), jnp.zeros(self.observer.history)),
@@ -178,10 +183,13 @@ class Live:
             agent = self.agent.restarted(state.agent)
         else:  # another kind of learner: take its actor alone
             agent = self.agent.with_actor(fresh.agent, actor)
-        kept = jax.tree.map(
-            jnp.copy, self.agent.actor(agent)
-        )  # a copy: the agent is donated, and no buffer may be twice
-        return fresh._replace(agent=agent, kept=kept, base=state.base, begun=jnp.ones((), bool))
+        kept = self.snapshot(agent)
+        trained = fresh._replace(agent=agent, kept=kept, incumbent=kept, candidate=kept)
+        return trained._replace(base=state.base, begun=jnp.ones((), bool))
+
+    def snapshot(self, agent: Any) -> Any:
+        """A copy of the agent's actor, which outlives the agent's donation."""
+        return jax.tree.map(jnp.copy, self.agent.actor(agent))
 
     def fallback(self, state: LiveState) -> Kept:
         """What acts while the learned policy does not."""
@@ -207,9 +215,9 @@ class Live:
 
     @partial(jax.jit, static_argnums=0)
     def act(
-        self, actors: tuple[Any, Any], base: LinearLaw, before: Sample, explore: Any, r: jax.Array, y: jax.Array
+        self, actors: tuple[Any, ...], base: LinearLaw, before: Sample, explore: Any, r: jax.Array, y: jax.Array
     ) -> tuple[Memory, jax.Array]:
-        """At t_k: the memory, and r~ (2,) of the fallback and the learned actor, both with `explore` added."""
+        """At t_k: the memory, and r~ (A,) of the actors, each with `explore` added."""
         memory = self.observer.record(before.memory, before.y, before.r_tilde)
         memory, obs = self.observer.observe(memory, r, y)
         actions = jnp.stack([self.policy.action(actor, obs) for actor in actors])
@@ -219,18 +227,19 @@ class Live:
     @partial(jax.jit, static_argnums=0)
     def relive(
         self, state: LiveState, actor: Any, now: Sample, step: jax.Array
-    ) -> tuple[Others, jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[Others, jax.Array, jax.Array, jax.Array, jax.Array]:
         """Advance the counterfactuals to t_k.
 
         Args:
             state: before t_k; its agent and replay are not used.
-            actor: of the counterfactuals.
+            actor: of the counterfactuals that explore.
             now: the loop's step t_k.
             step: k, uint32.
 
         Returns:
             The counterfactuals; the loop's next exploration noise; rows (E, width) for the replay, of the step up to
-            t_k; and y (3,) of the compared ones. Until the response is known, each row is the loop's.
+            t_k; and y (4,) of the compared ones and their rewards (4,). Until the response is known, each row is the
+            loop's.
         """
         key_noise, key_when, key_r = jax.random.split(jax.random.fold_in(state.key, step), 3)
         (low, high), n = self.env.plant.setpoint_range, COMPARED + EXPLORING
@@ -247,10 +256,10 @@ class Live:
         explore = noise.ornstein_uhlenbeck(before_noise, normal, THETA, sigma)
         other_noise = jnp.concatenate([jnp.zeros(COMPARED), explore[1:]])
 
-        actors = state.kept, actor
+        incumbent = jax.tree.map(partial(jnp.where, state.leads), state.incumbent, state.kept)
+        actors, of_lane = (state.kept, incumbent, state.candidate, actor), jnp.asarray([0, 0, 1, 2] + [3] * EXPLORING)
         memory, r_tilde = jax.vmap(self.act, (None, None, 0, 0, 0, 0))(actors, state.base, before, other_noise, r, y)
-        passed = jnp.clip(now.r, *self.observer.r_tilde_bounds)
-        r_tilde = r_tilde[:, 1].at[:2].set(jnp.stack([passed, r_tilde[1, 0]]))
+        r_tilde = r_tilde[jnp.arange(n), of_lane].at[0].set(jnp.clip(now.r, *self.observer.r_tilde_bounds))
         dr_tilde = jnp.column_stack([r_tilde - now.r_tilde, others.dr_tilde[:, :-1]])
         dy = jnp.column_stack([others.dy @ state.response.a + dr_tilde @ state.response.b, others.dy[:, :-1]])
         row = self.row(state.base, state.sample, now.r, now.y)
@@ -259,7 +268,8 @@ class Live:
         age = jnp.where(now.age == 0, 0, before.age + 1)
         held = jnp.where(r == before.r, before.held + 1, 0)
         others = Others(Sample(memory, r, y, r_tilde, age, held), dy, dr_tilde, other_noise)
-        return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED]
+        gained = rows[:COMPARED, FIELDS.index("reward")]
+        return others, explore[0], jnp.concatenate([row[None], rows]), y[:COMPARED], gained
 
     def row(self, base: LinearLaw, before: Sample, r: jax.Array, y: jax.Array) -> jax.Array:
         """The replay's row for the step from sample `before` to r and y; (width,).

@@ -18,14 +18,13 @@ import numpy as np
 from jaxouter.loop.policy import LinearLaw
 from jaxouter.runtime.controller import Transfer, Watch
 from jaxouter.runtime.online import WHYS, Kept, Live, LiveState, Sample, Stage, Why
+from jaxouter.training import gate
 
 RESERVE = 0.1  # share of a period kept free of updates
 FORGET = 0.9  # decay per update of the longest update time seen
 NAP = 0.2  # s, longest sleep before `stop` is asked again
-LATELY = 200  # control steps, time constant of the mean errors that are compared
-CAME, KEPT, LEARNED = 0, 2, 3  # index in the errors: the loop itself, the fallback, the learned policy
-BETTER = 0.9  # the learned policy takes over once its error is below 0.9 times the fallback's
-WORSE, SLACK = 1.25, 0.02  # it is sent back above 1.25 times the fallback's error plus 0.02 of half the set-point range
+BLOCKS, BLOCK = 10, 20  # blocks on whose mean rewards policies are judged, and control steps of each
+SURE = 2.0  # standard errors by which one must be better than what acts to take its place
 
 
 class StepError(Exception):
@@ -58,7 +57,7 @@ class Row(NamedTuple):
     why: Why
     y_passed: float | None  # predicted y if r had passed through all the time
     y_kept: float | None  # predicted y if the fallback had acted
-    y_learned: float | None  # predicted y if the learned policy had acted
+    y_learned: float | None  # predicted y if the newest learned policy had acted
 
 
 class Loop:
@@ -68,8 +67,9 @@ class Loop:
     that step; the policy acts again at the next one. The grid of periods is kept: whole periods that were missed are
     skipped.
 
-    The learned policy takes over once its predicted recent |r - y| is below the fallback's. If it turns out worse, the
-    fallback returns, for as many updates as at the start.
+    Every 200 steps what the agent has learned by then becomes the next candidate. It takes over if on the 200 steps
+    after that its predicted reward is better than that of what acts, see `jaxouter.training.gate`. If what acts turns
+    out worse than the fallback, this returns, for as many updates as at the start.
     """
 
     def __init__(
@@ -97,7 +97,8 @@ class Loop:
         """
         self.live, self.settings = live, settings
         self.act_seconds = array("f")
-        self.sent_back = 0  # times that the learned policy turned out worse
+        self.accepted = self.refused = 0  # candidates
+        self.sent_back = 0  # times that what was accepted turned out worse than the fallback
         self.trouble: str | None = None  # why the response is not identified yet
         self._state = state if settings.learn else state._replace(noise=jnp.zeros_like(state.noise))
         self._plant, self._reference, self._clock = plant, reference, clock
@@ -115,7 +116,7 @@ class Loop:
         self._unlearned = jax.device_get(live.fresh(state.key).agent)
         self._takeover_at = live.takeover
         self._known = bool(np.any(state.response.b))
-        self._errors = np.zeros(4)  # recent mean errors of the loop and of the compared policies
+        self._window: list[tuple[float, ...]] = []  # of the blocks: rewards of those judged, whether r changed
         self._compile()
         self._fastest = self._longest = self._update_takes() if settings.learn else 0.0
         self._begin, self._period = begin, 0
@@ -179,7 +180,7 @@ class Loop:
         if not self._met:
             before = self.live.first(r_seen, y_seen)
             self._met = fault is None
-        actors = self._state.kept, self.live.agent.actor(self._state.agent)
+        actors = self._state.kept, self._state.incumbent
         memory, offered = self.live.act(actors, self._state.base, before, self._state.noise, r_seen, y_seen)
         kept, learned = np.asarray(offered).tolist()
         wanted = {"recording": r, self.fallback: kept, "learned": learned}
@@ -214,10 +215,6 @@ class Loop:
             self._state = self._state._replace(agent=jax.block_until_ready(agent))
             self._updates += 1
             self._longest = max(self._fastest, FORGET * self._longest, self._clock() - begun)
-        better = self._errors[LEARNED] < BETTER * self._errors[KEPT]
-        if self._stage == self.fallback and self._updates >= self._takeover_at and better:
-            self._errors[CAME] = self._errors[KEPT]
-            self._enter("learned")
 
     def _measured(self) -> float | None:
         try:
@@ -259,7 +256,7 @@ class Loop:
             self._state = state._replace(sample=now)
             return [None] * 3
         rest, actor = state._replace(agent=None, replay=None), self.live.agent.actor(state.agent)
-        others, noise, rows, y_others = self.live.relive(rest, actor, now, np.uint32(self.steps))
+        others, noise, rows, y_others, gained = self.live.relive(rest, actor, now, np.uint32(self.steps))
         if self.settings.learn:
             state = state._replace(noise=noise)
         if self.settings.learn and follows:
@@ -268,19 +265,32 @@ class Loop:
         self._state = state._replace(sample=now, others=others)
         if not self._known:
             return [None] * 3
-        found = np.asarray(y_others)
-        if follows:
-            self._compare(float(before.r), np.append(y, found))
-        return found.tolist()
+        passed, kept, _, candidate = np.asarray(y_others).tolist()
+        if follows and self._stage != "recording":
+            self._window.append((*np.asarray(gained).tolist()[1:], float(held == 0)))
+        if len(self._window) == BLOCKS * BLOCK:
+            self._judge(np.asarray(self._window))
+        return [passed, kept, candidate]
 
-    def _compare(self, r: float, y: np.ndarray) -> None:
-        """Return to the fallback if the learned policy has been worse."""
-        self._errors += (np.abs(r - y) - self._errors) / LATELY
-        bound = WORSE * self._errors[KEPT] + SLACK * self.live.observer.y_scale
-        if self._stage == "learned" and self._errors[CAME] > bound:
+    def _judge(self, window: np.ndarray) -> None:
+        """Replace what acts by the candidate or the fallback if that is better, and choose the next candidate."""
+        blocks = window.reshape(BLOCKS, BLOCK, -1).mean(1)
+        of_kept, of_candidate = np.asarray(judged(*blocks.T)).tolist()
+        if self._stage == "learned" and of_kept > SURE:
             self.sent_back += 1
             self._takeover_at = self._updates + self.live.takeover
             self._enter(self.fallback)
+        elif self.settings.learn and self._updates >= self._takeover_at:
+            accepted = of_candidate > SURE
+            self.accepted, self.refused = self.accepted + accepted, self.refused + (not accepted)
+            if accepted:
+                self._state = self._state._replace(incumbent=self._state.candidate)
+                self._enter("learned")
+        self._next_candidate()
+
+    def _next_candidate(self) -> None:
+        self._window.clear()
+        self._state = self._state._replace(candidate=self.live.snapshot(self._state.agent))
 
     def _identify(self) -> None:
         """Identify the response, and the static inverse if r has passed through so far."""
@@ -310,6 +320,7 @@ class Loop:
             self._state = self._state._replace(replay=replay, base=law, agent=agent)
             self._takeover_at, self.trouble = self._updates + self.live.takeover, None
             self._enter(self.fallback)
+            self._next_candidate()
 
     def _compile(self) -> None:
         """Compile on copies, as the learner's buffers are donated."""
@@ -317,10 +328,12 @@ class Loop:
         r = y = self._float(live.observer.y_middle)
         sample = live.first(r, y)
         actor = live.agent.actor(state.agent)
-        live.act((state.kept, actor), state.base, sample, state.noise, r, y)
+        live.act((state.kept, state.incumbent), state.base, sample, state.noise, r, y)
         rest = state._replace(agent=None, replay=None)
         rows = live.relive(rest, actor, sample, np.uint32(0))[2]
         live.gathered(sample)
+        live.snapshot(state.agent)
+        judged(*np.zeros((4, BLOCKS)))
         if self.settings.learn:
             replay = live.write(jax.tree.map(jnp.copy, state.replay), rows)
             if live.kept == "static":
@@ -340,6 +353,18 @@ class Loop:
                 f"{1.0 - RESERVE:.0%} of a period for --learn"
             )
         return min(took)
+
+
+@jax.jit
+def judged(kept: jax.Array, incumbent: jax.Array, candidate: jax.Array, changed: jax.Array) -> jax.Array:
+    """By how many standard errors fallback and candidate are better than what acts; 0 for one that is worse somewhere.
+
+    Args:
+        kept, incumbent, candidate: mean rewards of blocks (B,).
+        changed: share of the steps of each in which r changed.
+    """
+    found = gate.judge(jnp.stack([kept, candidate]) - incumbent[None], gate.kind(changed))
+    return jnp.where(found.better, found.gain / jnp.maximum(found.error, 1e-12), 0.0)
 
 
 def run(

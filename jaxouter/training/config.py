@@ -195,10 +195,16 @@ class TrainConfig:
             return self.pairs.steps(episode_steps) + compared, self.pairs.updates_per_round
         return 2 * self.compared * episode_steps, 0
 
+    @property
+    def gated(self) -> bool:
+        """Whether the pretrained actor is compared with the base law before rounds of pairs continue from it."""
+        return self.pretraining.gradient_steps > 0 and self.pairs.rounds > 0
+
     def done_by(self, epoch: int, episode_steps: int) -> tuple[int, int]:
-        """The same of all epochs until then, the prefill included."""
+        """The same of all epochs until then, the prefill and the comparison before them included."""
         of_each = [self.steps_of(each, episode_steps) for each in range(epoch)]
         prefill = self.agent.data.before if epoch and self.agent_epochs else 0
+        prefill += 2 * self.compared * episode_steps if self.gated else 0
         return prefill + sum(steps for steps, _ in of_each), sum(updates for _, updates in of_each)
 
     @property

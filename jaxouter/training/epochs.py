@@ -113,6 +113,9 @@ def train(
         for seeds in rounds:
             yield from zip(seeds, fleet.take(states[seeds]), strict=True)
 
+    def of_seed(metrics: Row, i: int) -> Row:
+        return {name: float(value[i]) for name, value in metrics.items()}
+
     def save(epoch: int) -> None:
         for seed, state in every_seed():
             devices.in_first(partial(run.save, seed, epoch, state))
@@ -130,10 +133,15 @@ def train(
         report(seed, row)
 
     if cfg.pretraining.gradient_steps and not done:
+        compared: dict[int, Row] = {}
+        for seeds in rounds if cfg.gated else ():
+            say("compiling", 0, 0)
+            states[seeds], metrics = fleet.check(states[seeds], params)
+            compared |= {seed: of_seed(devices.get(metrics), i) for i, seed in enumerate(seeds)}
         rates = {"seconds": (time.perf_counter() - begun) / cfg.seeds}
         for seed, state in every_seed():  # the result of pretraining is the row of epoch 0
             _check(seed, 0, state)
-            devices.in_first(partial(keep, seed, state, 0, {}, rates))
+            devices.in_first(partial(keep, seed, state, 0, compared.get(seed, {}), rates))
         pace.do(partial(save, 0))
     for epoch in range(done, cfg.epochs):
         if epoch in (done, cfg.agent_epochs, cfg.agent_epochs + cfg.pairs.rounds):
@@ -156,8 +164,7 @@ def train(
             }
             for i, (seed, state) in enumerate(zip(seeds, fleet.take(states[seeds]), strict=True)):
                 _check(seed, epoch + 1, state)
-                found = {name: float(value[i]) for name, value in metrics.items()}
-                devices.in_first(partial(keep, seed, state, epoch + 1, found, rates))
+                devices.in_first(partial(keep, seed, state, epoch + 1, of_seed(metrics, i), rates))
         stopping = devices.any_process(stop())
         if devices.any_process(stopping or epoch + 1 == cfg.epochs or (devices.is_first() and pace.due())):
             pace.do(partial(save, epoch + 1))

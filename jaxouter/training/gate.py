@@ -53,11 +53,15 @@ def reward_of(
 
     keys = jax.random.split(key_run, env.plant.episode_steps)
     (_, last), (rewards, changes) = jax.lax.scan(step, (obs, state), keys)
-    changed = jnp.mean(changes)
-    stratum = jnp.where(changed > OFTEN, 2, jnp.where(changed > 0.0, 1, 0))
+    stratum = kind(jnp.mean(changes))
     if last.disturbance is not None:
         stratum += jnp.where(last.disturbance.noise > 0.0, 3, 0) + jnp.where(last.disturbance.load.size != 0.0, 6, 0)
     return jnp.mean(rewards), stratum
+
+
+def kind(changed: jax.Array) -> jax.Array:
+    """The kind of a reference, by the share of steps in which it changes: 0 if it stays, 1 if it jumps, else 2."""
+    return jnp.where(changed > OFTEN, 2, jnp.where(changed > 0.0, 1, 0))
 
 
 def compare(

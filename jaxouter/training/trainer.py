@@ -167,7 +167,8 @@ class Trainer:
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def check(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
         """The state with an actor that is no worse than the base law alone; see `Improvement`."""
-        key, before = jax.random.fold_in(state.key, CHECK), self.agent.actor(state.agent)
+        rounds = state.pairs.rounds if self.config.pairs.rounds else 0  # other episodes before them
+        key, before = jax.random.fold_in(jax.random.fold_in(state.key, CHECK), rounds), self.agent.actor(state.agent)
         actor, metrics = self.improvement.check(before, state.base, params, key)
         return state._replace(agent=self.agent.with_actor(state.agent, actor)), metrics
 

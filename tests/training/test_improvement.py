@@ -11,8 +11,13 @@ import pytest
 
 from jaxouter.agents.pairs import PairsConfig
 from jaxouter.loop.disturbances import Disturbances
+from jaxouter.plants.registry import add
+from jaxouter.training.config import PretrainingConfig
+from jaxouter.training.epochs import train
 from jaxouter.training.gate import compare, judge
+from jaxouter.training.run import RunFolder
 from jaxouter.training.trainer import build
+from tests import kinds
 from tests.training.small import small
 
 PAIRS = PairsConfig(rounds=3, states=1024, environments=16, horizon=20, change=0.1, updates=100, batch_size=128)
@@ -74,6 +79,15 @@ def test_the_gain_of_no_change_is_nothing_and_pairs_are_paired(started):
     np.testing.assert_array_equal(unchanged.gain, 0.0)
 
 
+def test_a_perfect_actor_stays_as_good_as_it_is():
+    perfect = dict(base="none", correction=0.5, **LEARNING | dict(disturbances=Disturbances()))
+    trainer, params = build(small(add(kinds.AtOnce), **perfect))
+    state = trainer.start(0, params)
+    after, _ = improved(trainer, params, state)
+    found = gained(trainer, params, state.base, state.agent.actor, after.agent.actor)
+    assert found["gain"] > -1e-3  # of half the range of set-points, per step
+
+
 def test_in_the_end_the_base_law_remains_where_what_was_learned_is_worse(started):
     trainer, params, state = started
     good, _ = improved(trainer, params, state)
@@ -85,6 +99,18 @@ def test_in_the_end_the_base_law_remains_where_what_was_learned_is_worse(started
         after, found = trainer.check(jax.tree.map(jnp.copy, before), params)
         assert float(found["kept"]) == kept
         chex.assert_trees_all_equal(after.agent.actor, jax.tree.map(lambda leaf, kept=kept: kept * leaf, actor))
+
+
+def test_before_the_rounds_a_pretrained_actor_is_kept_only_where_it_is_better_than_the_base_law(tmp_path):
+    start = PretrainingConfig(gradient_steps=2, episodes=2, batch_size=2)
+    fewer = replace(PAIRS, rounds=1, states=64, environments=4, horizon=5, updates=4, batch_size=16)
+    run = RunFolder.create(small(base="static", pretraining=start, **LEARNING | dict(pairs=fewer)), tmp_path / "run")
+    train(run)
+    row = run.rows(0)[0]
+    assert row["epoch"] == 0
+    assert row["steps"] == 2 * 128 * run.trainer[0].env.plant.episode_steps
+    assert row["kept"] == (row["gain"] > row["error"])
+    assert row["error"] > 0.0
 
 
 def test_an_actor_is_not_better_than_itself(started):
