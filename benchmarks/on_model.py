@@ -14,7 +14,6 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import jax
 import tyro
@@ -32,7 +31,6 @@ from jaxouter.training.trainer import Trainer, build
 HERE = Path(__file__).parent
 LOOPS = {"pitch": "pitch", "tanks": f"{HERE.parent}/scripts/examples/tanks.py:Tanks"}
 FAMILIES = ("steps", "staircase", "ramps")
-PRETRAINED: dict[str, Any] = {"pretraining": {"gradient_steps": 1_500}}
 
 
 def on_model(trainer: Trainer, params: EnvParams, seed: int) -> tuple[Trainer, EnvParams]:
@@ -62,8 +60,9 @@ def learned(plant: str, seed: int) -> Iterator[tuple[str, list[float]]]:
         on = [scenarios.get(f"{trainer.config.plant}/{family}") for family in FAMILIES]
         return [each.figures.mae or float("nan") for each in evaluate_on(policy, on).values()]
 
-    for name, settings in (("", {}), ("model-based pretraining", PRETRAINED)):
-        trainer, params = build(choose(configured(plant, "default", None, None, {"seed": seed, **settings})).config)
+    for name, steps in (("", 0), ("model-based pretraining", 1_500)):
+        settings = {"seed": seed, "pretraining": {"gradient_steps": steps}}
+        trainer, params = build(choose(configured(plant, "default", None, None, settings)).config)
         begun = jax.device_get(trainer.start(seed, params))
         yield name or "LQ law", measured(trainer, params, begun)
         modelled, of_model = on_model(trainer, params, seed)

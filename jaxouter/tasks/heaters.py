@@ -23,7 +23,7 @@ RECORD = {
     "disturbances.noise": 0.02,
     "disturbances.load": 0.2,
 }
-DEFAULT = {**RECORD, "reward.beta_h": 0.06, "reward.delta_b": 2.0, "pairs.change": 0.1}
+DEFAULT = {**RECORD, "reward.beta_h": 0.06, "reward.delta_b": 2.0, "pairs.rounds": 30, "pairs.change": 0.1}
 SCRATCH = {
     **HOURLY,
     "agent.n_step": 3,

@@ -17,7 +17,14 @@ DELAYED = (10.13, 2.46)  # the paper's only delayed case; no reading of it gives
 
 # The linear law is nearly the best there is: small corrections, for which moves of r~ cost nothing.
 RECORD = {"correction": 0.1, "reward.beta_h": 0.0}
-DEFAULT = {**RECORD, "reward.rest": 0.02}
+DEFAULT = {
+    **RECORD,
+    "reward.rest": 0.02,
+    "disturbances.noise": 0.015,
+    "pretraining.gradient_steps": 0,
+    "pairs.rounds": 30,
+}
+SCRATCH = {"disturbances.load": 0.15}
 ROBUST = {
     "base": "static",
     "correction": 1.0,
@@ -62,7 +69,7 @@ def _vary(*names: str, longest: float | None = None) -> Any:
 # The longest delay sets the length of the delay lines, and with it the cost of a step: keep it short.
 PITCH = Task(
     make=pitch.make,
-    presets={"default": DEFAULT, "scratch": {}, "record": RECORD, "robust": ROBUST, "paper": {}},
+    presets={"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "robust": ROBUST, "paper": {}},
     scenarios={
         "paper": Scenario((SETPOINT,), paper=(10.91, 3.90)),
         "delay-0.57": _delayed(0.57, 0.57),

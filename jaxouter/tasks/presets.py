@@ -38,10 +38,9 @@ RECORD: Options = {
 }
 DEFAULT: Options = {
     **RECORD,
-    "correction": 0.3,
-    "reward.beta_h": 0.02,
-    "pretraining.gradient_steps": 0,
-    "pairs.rounds": 30,
+    "reward.beta_h": 0.03,  # the paper has 0.1
+    "disturbances.noise": 0.005,
+    "pairs.rounds": 45,
 }
 SCRATCH: Options = {
     **RECORD,
@@ -57,7 +56,7 @@ SCRATCH: Options = {
     "agent.prefill": 12_800,
     "agent.replay": 102_400,
     "agent.noise_sigma": (0.005, 0.03),
-    "pairs.rounds": 30,
+    "pairs.rounds": 36,
     "pairs.wander": False,
     "pairs.change": 0.1,
     "pairs.noise_sigma": (0.005, 0.03),

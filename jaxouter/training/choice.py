@@ -61,13 +61,11 @@ def choose(config: TrainConfig) -> Choice:
 
 def _on_host(config: TrainConfig) -> TrainConfig:
     """The configuration on a plant outside JAX: it can't be branched, and its episodes may be slow."""
-    config = replace(config, compared=min(config.compared, ON_HOST))
-    if not config.pairs.rounds:
+    config = replace(config, compared=min(config.compared, ON_HOST), pairs=replace(config.pairs, rounds=0))
+    if config.steps or config.pretraining.gradient_steps:
         return config
-    record = tasks.options(config.plant, "record")
-    steps = config.pretraining.gradient_steps or record["pretraining.gradient_steps"]
-    start, pairs = replace(config.pretraining, gradient_steps=steps), replace(config.pairs, rounds=0)
-    return replace(config, pairs=pairs, pretraining=start, correction=record.get("correction", 1.0))
+    steps = tasks.options(config.plant, "record")["pretraining.gradient_steps"]
+    return replace(config, pretraining=replace(config.pretraining, gradient_steps=steps))
 
 
 def _of_models(params: Any) -> Dynamics:
