@@ -86,11 +86,12 @@ def test_unknown_preset_lists_those_that_exist():
 
 def test_a_plant_of_ones_own_has_presets_without_what_is_pitchs(monkeypatch):
     monkeypatch.setitem(plants.REGISTRY, "lag", lag.make)
-    of_default = dict(correction=0.3), dict(beta_h=0.02, rest=0.05)
-    rest = dict(correction=1.0), dict(beta_h=0.1)
-    for name, (own, of_reward) in dict(default=of_default, scratch=rest, record=rest, paper=rest).items():
-        pitch = preset("pitch", name)
-        wanted = replace(pitch, plant="lag", reward=replace(pitch.reward, **of_reward), **own)
+    paid = {"correction": 1.0, "reward.beta_h": 0.1}
+    default = {"reward.beta_h": 0.03, "reward.rest": 0.05, "disturbances.noise": 0.005, "pairs.rounds": 45}
+    default["pretraining.gradient_steps"] = 1_500
+    scratch = {"disturbances.load": 0.1}
+    for name, own in dict(default=default, scratch=scratch, record={}, paper={}).items():
+        wanted = with_options(replace(preset("pitch", name), plant="lag"), paid | own)
         assert preset("lag", name).check() == wanted
     with pytest.raises(ValueError, match="no preset 'robust' for lag; the presets are: default, scratch, record,"):
         preset("lag", "robust")
