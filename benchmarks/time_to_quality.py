@@ -27,6 +27,8 @@ import tyro
 
 from jaxouter import cli
 from jaxouter.evaluation import scenarios
+from jaxouter.evaluation.baselines import LIMITS, SIMPLE
+from jaxouter.evaluation.jobs import limit as best
 from jaxouter.evaluation.policies import baseline, evaluate_on
 from jaxouter.training.run import surroundings, write_json
 
@@ -41,16 +43,16 @@ OURS = {
 }
 PEERS = [(library, learner) for library in ("stable-baselines3", "sbx") for learner in ("DDPG", "TD3", "SAC")]
 NEAR = (1.25, 1.10, 1.05)  # times the limit
-LIMITS = ("oracle", "lq-exact", "mpc-exact")
 
 Point = dict[str, float]  # seconds, steps, mae
 
 
 def limit() -> float:
     """The least MAE of those that know the plant."""
-    scenario = scenarios.get(SCENARIO)
-    found = [evaluate_on(baseline(name, "pitch"), [scenario])[SCENARIO].figures.mae for name in LIMITS]
-    return min(mae for mae in found if mae is not None)
+    on = [scenarios.get(SCENARIO)]
+    found = best({name: evaluate_on(baseline(name, "pitch"), on)[SCENARIO].figures for name in (*LIMITS, *SIMPLE)})
+    assert found is not None
+    return found
 
 
 def ours(options: tuple[str, ...], seed: int, below: float, seconds: float) -> Iterator[Point]:

@@ -83,7 +83,7 @@ class Job(NamedTuple):
     what: Literal["identify", "evaluate", "sweep", "stability"]
     entrant: Entrant
     plant: str
-    on: str = ""  # scenario or sweep
+    on: str = ""  # scenario or sweep; of an identification, the plant where it is another one
     family_seed: int = scenarios.FAMILY_SEED
 
     @property
@@ -92,6 +92,13 @@ class Job(NamedTuple):
         if self.what == "identify":
             return IDENTIFY.get(self.entrant.name, 1.0)
         return {"evaluate": 1.0, "sweep": 5.0, "stability": 3.0}[self.what]
+
+    @property
+    def needs(self) -> tuple[Entrant, str]:
+        """Policy, and the plant on which it is identified."""
+        if self.what == "identify":
+            return self.entrant, self.on or self.plant
+        return self.entrant, self.plant if self.what == "sweep" else made_for(self.entrant, self.plant, self.on)
 
     def __str__(self) -> str:
         seed = "" if self.entrant.seed is None else f" seed {self.entrant.seed}"
@@ -122,6 +129,11 @@ def entrant(name: str, plant: Plant) -> Entrant:
     if name not in possible(plant):
         raise ValueError(f"there is no {name} for {plant.name}, which is not declared {NEEDS[name]}")
     return Entrant(name, "preview" if name == CLAIRVOYANT else resolve(name).kind)
+
+
+def made_for(entrant: Entrant, plant: str, on: str) -> str:
+    """Name of the plant for which a policy is made that acts in a scenario: a limit knows the scenario's own."""
+    return scenarios.known(on) if entrant.kind == "limit" else plant
 
 
 def short(name: str) -> str:
@@ -176,7 +188,7 @@ def evaluate(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tu
         best = plan(scenario)
         traces = rollout(Replay(), best.r_tilde, scenario, per_episode=True)
     else:
-        traces = rollout(*load(entrant, plant_name), scenario)
+        traces = rollout(*load(entrant, made_for(entrant, plant_name, on)), scenario)
     arrays = {name: getattr(traces, name)[:1] for name in TRACES}
     arrays["mae"] = np.mean(np.abs(traces.r - traces.y), axis=1)
     figures = msgspec.to_builtins(figures_of_merit(traces, scenario))
@@ -198,7 +210,8 @@ def analyse(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tun
     scenario = scenarios.get(on, 1, family_seed)
     params = jax.tree.map(lambda leaf: leaf[0], scenario.params)
     points = np.linspace(*scenario.plant.evaluation_range, SET_POINTS)
-    rows = stability.analyse(*load(entrant, plant_name), scenario.plant, params, points.tolist())
+    acting = load(entrant, made_for(entrant, plant_name, on))
+    rows = stability.analyse(*acting, scenario.plant, params, points.tolist())
     return Tuned({"rows": msgspec.to_builtins(rows)}, {}, 0)
 
 
@@ -216,7 +229,7 @@ def _run(job: Job, report: Report) -> Done:
     begin, c = time.perf_counter(), job.entrant
     report("", 0.0)
     if job.what == "identify":
-        return Done(job, identified(c.name, job.plant, report), time.perf_counter() - begin)
+        return Done(job, identified(c.name, job.needs[1], report), time.perf_counter() - begin)
     work = {"evaluate": evaluate, "sweep": sweep, "stability": analyse}[job.what]
     if c.kind == "learned":
         found = work(c, job.plant, job.on, job.family_seed)
@@ -234,7 +247,12 @@ def jobs(
     plant: str, entrants: Sequence[Entrant], selected: Sequence[str], swept: Sequence[str], family_seed: int
 ) -> list[Job]:
     """All jobs: identification first, of it the long ones."""
-    work = [Job("identify", c, plant) for c in reversed(entrants) if c.kind in TUNED]
+    work = [
+        Job("identify", c, plant, "" if of == plant else of)
+        for c in reversed(entrants)
+        if c.kind in TUNED
+        for of in dict.fromkeys([plant, *(made_for(c, plant, on) for on in selected)])
+    ]
     acting = [c for c in entrants if c.kind != "preview"]
     first_seeds = {c.line: c for c in reversed(acting)}  # of each run, for sweeps and stabilities
     one_seed = [c for c in acting if first_seeds[c.line] == c]
@@ -320,8 +338,8 @@ def spread(
     context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork would not survive
     messages = context.SimpleQueue()
     with ProcessPoolExecutor(min(cores, len(work)), context, _Worker.begin, (messages, initialise)) as pool:
-        identifying = {job.entrant for job in work if job.what == "identify"}
-        free = [job for job in work if job.what == "identify" or job.entrant not in identifying]
+        identifying = {job.needs for job in work if job.what == "identify"}
+        free = [job for job in work if job.what == "identify" or job.needs not in identifying]
         try:
             with _starting():
                 waiting = {pool.submit(_Worker.run, job) for job in free}
@@ -332,7 +350,7 @@ def spread(
                 for future in done:
                     finished = future.result()
                     if finished.job.what == "identify":
-                        freed = (job for job in work if job.entrant == finished.job.entrant and job != finished.job)
+                        freed = (job for job in work if job.needs == finished.job.needs and job != finished.job)
                         with _starting():
                             waiting |= {pool.submit(_Worker.run, job) for job in freed}
                     yield finished
@@ -362,7 +380,7 @@ def prepare(registered: Iterable[Registration], agents: Iterable[str]) -> None:
 
 def policies(entrants: Sequence[Entrant], done: Sequence[Done]) -> dict[str, PolicyInfo]:
     """What each policy is, and what its identification and tuning took."""
-    tuned = {d.job.entrant.name: d.found for d in done if d.job.what == "identify"}
+    tuned = {d.job.entrant.name: d.found for d in done if d.job.what == "identify" and not d.job.on}
     paths = dict.fromkeys(Path(c.path or "") for c in entrants if c.kind == "learned")
     configs = {path.name: RunFolder.open(path).config for path in paths}
 

@@ -177,11 +177,13 @@ def evaluate(
         total = sum(work(chosen.name, each) for each in selected)
         progress.phase("evaluating", total, counter=counter(each.plant for each in selected))
         own = jobs.is_own(policy) if isinstance(policy, str) else not isinstance(policy, NamedPolicy)
+        limit = isinstance(policy, str) and policy in baselines.LIMITS
         results: Results = {}
         for i, each in enumerate(selected):
             progress.say(scenario=f"{each.id}, {i + 1} of {len(selected)} scenarios")
+            acting = named(policy, scenarios.known(each.id), progress) if limit else chosen
             with jobs.blamed(chosen.name, f"failed on {each.id}", own):
-                results |= evaluate_on(chosen, [each])
+                results |= evaluate_on(acting, [each])
             progress.advance(work(chosen.name, each))
     return results
 

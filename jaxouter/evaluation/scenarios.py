@@ -14,7 +14,7 @@ from jaxouter import tasks
 from jaxouter.loop import sensor as sensors
 from jaxouter.loop.references import FAMILIES
 from jaxouter.loop.sensor import SensorParams
-from jaxouter.plants import Plant, Ranges, base, make, parameters
+from jaxouter.plants import Plant, Ranges, base, make, parameters, with_parameters
 
 FAMILY_SEED = 2024
 FAMILY_MEMBERS = 64
@@ -127,6 +127,26 @@ def catalogue(name: str, family_seed: int = FAMILY_SEED) -> dict[str, Builder]:
 def plant_of(identifier: str) -> str:
     """The plant's name in a scenario's id, which may hold parameters, and so a slash of its own."""
     return identifier.rpartition("/")[0] or identifier
+
+
+def known(identifier: str) -> str:
+    """Name of the plant that those who know the plant of a scenario know: with the parameters that its task sets.
+
+    What makes no other plant (how many houses there are, and where they start) is left out. Where the inner loop alone
+    is unstable, they know the nominal plant: a record of that one diverges.
+    """
+    plant, _, name = identifier.rpartition("/")
+    task = tasks.of(plant)
+    spec = task.scenarios.get(name)
+    if spec is None or not spec.stable_alone:
+        return plant
+    nominal = _numbers(make(plant)[1], task.start)
+
+    def differs(setting: str) -> bool:
+        other = _numbers(make(plant, **{setting: spec.set[setting]})[1], task.start)
+        return any(not np.array_equal(leaf, nominal[name]) for name, leaf in other.items())
+
+    return with_parameters(plant, {setting: spec.set[setting] for setting in filter(differs, spec.set)})
 
 
 def builder(identifier: str, family_seed: int = FAMILY_SEED) -> Builder:

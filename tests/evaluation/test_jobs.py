@@ -261,6 +261,18 @@ def test_only_baselines_and_the_limit_are_identified():
     assert [job.entrant for job in first] == [ORACLE, STATIC, NONE]  # the longest first
 
 
+def test_the_limit_is_identified_on_each_plant_of_the_scenarios():
+    all_of = jobs.jobs("pitch", ALL, ["pitch/paper", "pitch/delay-0.57", "pitch/noise"], ["pitch/gain"], 7)
+    first = [(job.entrant, job.on) for job in all_of if job.what == "identify"]
+    own = "pitch(d1=0.57, d2=0.57)"
+    assert first == [(ORACLE, ""), (ORACLE, own), (STATIC, ""), (NONE, "")]
+    needs = {(job.what, job.on): job.needs[1] for job in all_of if job.entrant == ORACLE}
+    assert needs.pop(("evaluate", "pitch/delay-0.57")) == needs.pop(("stability", "pitch/delay-0.57")) == own
+    assert needs.pop(("identify", own)) == own
+    assert set(needs.values()) == {"pitch"}
+    assert {job.needs[1] for job in all_of if job.entrant != ORACLE} == {"pitch"}
+
+
 def test_sweeps_take_the_first_seed_of_each_run_and_nothing_with_preview():
     rest = after("pitch", ALL, ["pitch/steps"], ["pitch/gain", "pitch/pilot-delay"], 7)
     acting = {LEARNED[0], OTHER_RUN, USER, NONE, STATIC, ORACLE}

@@ -99,6 +99,24 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
     chex.assert_shape(rollout(*none(scenario.plant), scenario).y, (3, 100))
 
 
+@pytest.mark.parametrize(
+    ("identifier", "plant"),
+    [
+        ("pitch/paper", "pitch"),
+        ("pitch/steps", "pitch"),
+        ("pitch/delay-0.57", "pitch(d1=0.57, d2=0.57)"),
+        ("pitch/delay-5.7", "pitch"),  # which is unstable alone
+        ("pitch(tau=0.7)/delay-0.57", "pitch(tau=0.7, d1=0.57, d2=0.57)"),
+        ("heaters/paper-1000", "heaters"),  # more houses of the same kind
+        ("heaters/load", "heaters"),
+        ("heaters/cold", "heaters(x_out=-15.0)"),
+        ("heaters/riccati", "heaters(Pi=17.186)"),
+    ],
+)
+def test_plant_of_a_scenario_for_those_who_know_it(identifier, plant):
+    assert scenarios.known(identifier) == plant
+
+
 def test_unknown_scenario_lists_those_that_exist():
     with pytest.raises(ValueError, match="no scenario 'pitch/papers'; pitch has: pitch/paper, "):
         scenarios.get("pitch/papers")
