@@ -3,11 +3,11 @@
     python benchmarks/sample_efficiency.py              # train what is not there yet; two hours
     python benchmarks/sample_efficiency.py heaters      # one plant
 
-`paper`, `scratch` and `default` learn as they go: a point of their curves is an evaluation after an epoch or a round. Runs
-of `paper` are cut where the curve has long been flat (nothing in the preset depends on the length). `record` learns from
-recorded episodes alone: a point is a run of its own that recorded so many. All count every step of the plant, those of
-identification, of pairs and of the gate included. The MAE is that of the first of the paper's scenarios, on which nothing
-is trained. Table, curve and numbers go to results/.
+`paper`, `scratch` and `default` learn as they go: a point of their curves is an evaluation after an epoch or a round.
+Runs of `paper` are cut where the curve has long been flat (nothing in the preset depends on the length). `record` learns
+from recorded episodes alone: a point is a run of its own that recorded so many. All count every step of the plant, those
+of identification, pairs and gate included. The MAE is that of the first of the paper's scenarios, on which nothing is
+trained. Table, curve and numbers go to results/.
 """
 
 from __future__ import annotations
@@ -141,10 +141,9 @@ def main(
         scenario = scenarios.get(scenarios.reported(plant)[0])
         found = curves(plant, runs)
         known = {name: evaluate_on(baseline(name, plant), [scenario])[scenario.id] for name in ("static", *LIMITS)}
-        static, limit = (
-            known["static"].figures.mae or np.inf,
-            best({name: each.figures for name, each in known.items()}),
-        )
+        static, limit = known["static"].figures.mae, best({name: each.figures for name, each in known.items()})
+        assert static is not None
+        assert limit is not None
         levels = {"static": static, f"{NEAR:g} x the limit": NEAR * limit, "limit": limit}
         rows: dict[str, Any] = {}
         for name, curve in found.items():
