@@ -4,10 +4,10 @@
     python benchmarks/sample_efficiency.py heaters      # one plant
 
 `paper`, `scratch` and `default` learn as they go: a point of their curves is an evaluation after an epoch or a round.
-Runs of `paper` are cut where the curve has long been flat (nothing in the preset depends on the length). `record` learns
-from recorded episodes alone: a point is a run of its own that recorded so many. All count every step of the plant, those
-of identification, pairs and gate included. The MAE is that of the first of the paper's scenarios, on which nothing is
-trained. Table, curve and numbers go to results/.
+Runs of `paper` are cut where the curve has long been flat (nothing in the preset depends on the length). `record`
+learns from recorded episodes alone: a point is a run of its own that recorded so many. All count every step of the
+plant, those of identification, pairs and gate included. The MAE is that of the first of the paper's scenarios, on
+which nothing is trained. Table, curve and numbers go to results/.
 """
 
 from __future__ import annotations
