@@ -38,7 +38,7 @@ STEPS = {"pitch": 120_000, "heaters": 60_000}  # of the preset `paper`
 EPISODES = (1, 4, 16, 64)  # of the preset `record`
 COLORS = {
     "paper": figures.MODIFIED,
-    "scratch": figures.INNER,
+    "scratch": figures.REFERENCE,
     "record": figures.LIMIT,
     "default": figures.LEARNED,
 }

@@ -144,7 +144,7 @@ def known(identifier: str) -> str:
 
     def differs(setting: str) -> bool:
         other = _numbers(make(plant, **{setting: spec.set[setting]})[1], task.start)
-        return any(not np.array_equal(leaf, nominal[name]) for name, leaf in other.items())
+        return any(not np.array_equal(leaf, nominal[key]) for key, leaf in other.items())
 
     return with_parameters(plant, {setting: spec.set[setting] for setting in filter(differs, spec.set)})
 
