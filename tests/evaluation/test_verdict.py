@@ -62,6 +62,14 @@ def test_what_is_worse_than_doing_nothing_is_named_by_seed() -> None:
     json.dumps(msgspec.to_builtins(found), allow_nan=False)
 
 
+def test_where_the_lq_law_has_the_lower_mae_it_is_said_and_nothing_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, slope in (("static", 1.5), ("lq", 2.0)):
+        monkeypatch.setitem(SIMPLE, name, affine(slope))
+    found = judged(s0=1.9)
+    assert found.worse == []
+    assert "what was learned is better than none and static, but lq has the lower MAE; MAE: learned" in found.text
+
+
 def test_worse_is_worse_by_however_little() -> None:
     assert _is_worse(1.0 + np.array([0.2, -0.1, 0.0, 0.0]), np.ones(4))
     assert not _is_worse(np.ones(4), np.ones(4))
