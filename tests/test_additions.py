@@ -103,9 +103,9 @@ def test_compared_and_live(folder, tmp_path, monkeypatch):
 
 
 def test_the_plant_has_presets_scenarios_and_a_sweep_of_its_own(tmp_path):
-    run = jaxouter.learn(PLANT, "quick", out=tmp_path / "run", progress=False)
+    run = jaxouter.learn(PLANT, "quick", out=tmp_path / "run", progress=False, set={"tau": 4})  # as in test_api
     assert (run.config.preset, run.config.agent.hidden, run.config.pretraining.gradient_steps) == ("quick", (8, 8), 20)
-    assert set(run.summary.results[0].scenarios) == {"Room/day"}
+    assert set(run.summary.results[0].scenarios) == {"Room(tau=4)/day"}
 
 
 @pytest.mark.parametrize(

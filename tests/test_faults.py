@@ -72,7 +72,7 @@ def test_a_full_disk_ends_the_run_with_one_line_and_leaves_the_last_checkpoint_w
 
 
 def test_a_second_run_into_one_folder_is_refused(tmp_path):
-    run = begun(tmp_path / "run")
+    run = RunFolder.create(small(), tmp_path / "run")
     with lock(run.path):
         files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
         done = ended(sys.executable, "-m", "jaxouter.train", "--resume", str(run.path))

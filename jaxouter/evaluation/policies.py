@@ -169,7 +169,8 @@ def evaluate(
         default = policy.plant if isinstance(policy, NamedPolicy) else "pitch"
         plant = add(plant or default, parameters=set)
         names = scenarios.identifiers(plant, several(scenario))
-        chosen = named(policy, plant, progress)
+        limit = isinstance(policy, str) and policy in baselines.LIMITS  # which is made for the plant of each scenario
+        chosen = named(policy, scenarios.known(names[0]) if limit else plant, progress)
         rollouts = 1 if chosen.name == "none" else 2
         if pace.seconds(names, episodes, rollouts) > pace.SAID:
             progress.print(f"{pace.told(names, episodes, rollouts)}; --episodes N is N of each")
@@ -177,7 +178,6 @@ def evaluate(
         total = sum(work(chosen.name, each) for each in selected)
         progress.phase("evaluating", total, counter=counter(each.plant for each in selected))
         own = jobs.is_own(policy) if isinstance(policy, str) else not isinstance(policy, NamedPolicy)
-        limit = isinstance(policy, str) and policy in baselines.LIMITS
         results: Results = {}
         for i, each in enumerate(selected):
             progress.say(scenario=f"{each.id}, {i + 1} of {len(selected)} scenarios")

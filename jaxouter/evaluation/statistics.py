@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy
 from msgspec.structs import replace
 
 from jaxouter.evaluation.baselines import Kind

@@ -15,7 +15,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import lfilter, savgol_filter
+import scipy
 
 from jaxouter.identification.records import Record
 from jaxouter.plants import Plant, simulate
@@ -62,8 +62,8 @@ def fit(data: Record, lags: int) -> CounterfactualParams:
 def _smoothed(y: np.ndarray, disturbance: np.ndarray, a: np.ndarray) -> np.ndarray:
     """`y` (E, T + 1) without the effect of the fast part of the disturbance (E, T - n + 1) on its last samples."""
     window = min(disturbance.shape[1], y.shape[1] // 4) // 2 * 2 + 1
-    fast = disturbance - savgol_filter(disturbance, window, min(2, window - 1))
-    effect = np.asarray(lfilter([1.0], np.append(1.0, -a), fast))
+    fast = disturbance - scipy.signal.savgol_filter(disturbance, window, min(2, window - 1))
+    effect = np.asarray(scipy.signal.lfilter([1.0], np.append(1.0, -a), fast))
     return np.concatenate([y[:, : -effect.shape[1]], y[:, -effect.shape[1] :] - effect], 1)
 
 

@@ -6,7 +6,7 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from jaxouter.identification.records import Record
 from jaxouter.plants.arx import Model
@@ -140,7 +140,7 @@ def offset(model: Model) -> float:
 
 def step_response(model: Model, steps: int) -> np.ndarray:
     """Change of y_0 to y_(steps - 1) after a unit step of r~ at 0; (steps,)."""
-    return np.asarray(lfilter(np.append(0.0, model.b), np.append(1.0, -model.a), np.ones(steps)))
+    return np.asarray(scipy.signal.lfilter(np.append(0.0, model.b), np.append(1.0, -model.a), np.ones(steps)))
 
 
 def settling(model: Model) -> int:

@@ -18,7 +18,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 
 from jaxouter.identification import counterfactual
 from jaxouter.identification.records import Record

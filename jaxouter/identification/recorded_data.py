@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter, lfiltic
+import scipy
 
 from jaxouter.identification import columns
 from jaxouter.identification.dynamics import history_for
@@ -120,8 +120,8 @@ def free_run(model: Model, data: RecordedData, first: int, rows: int) -> np.ndar
         first, rows: start and length.
     """
     level, delayed, past = offset(model), np.append(0.0, model.b), np.append(1.0, -model.a)
-    known = lfiltic(delayed, past, data.y[:first][::-1] - level, data.r_tilde[:first][::-1])
-    return np.asarray(lfilter(delayed, past, data.r_tilde[first : first + rows], zi=known)[0]) + level
+    known = scipy.signal.lfiltic(delayed, past, data.y[:first][::-1] - level, data.r_tilde[:first][::-1])
+    return np.asarray(scipy.signal.lfilter(delayed, past, data.r_tilde[first : first + rows], zi=known)[0]) + level
 
 
 def fit(data: RecordedData, n: int, dead: int, rows: np.ndarray) -> Model:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxouter.identification.linear_models import gain, settling, step_response
 from jaxouter.identification.recorded_data import Ensemble, RecordedData, free_run, without_last_quarter
@@ -141,8 +141,8 @@ def _root_mean_square(errors: np.ndarray) -> float:
 
 def _one_step(model: Model, data: RecordedData, first: int) -> np.ndarray:
     """One-step prediction errors of the rows from `first` on."""
-    of_y = signal.lfilter(np.append(1.0, -model.a), [1.0], data.y)
-    of_r_tilde = signal.lfilter(np.append(0.0, model.b), [1.0], data.r_tilde)
+    of_y = scipy.signal.lfilter(np.append(1.0, -model.a), [1.0], data.y)
+    of_r_tilde = scipy.signal.lfilter(np.append(0.0, model.b), [1.0], data.r_tilde)
     return (np.asarray(of_y) - np.asarray(of_r_tilde))[first:] - model.c
 
 
@@ -150,7 +150,7 @@ def _band(models: Ensemble, data: RecordedData, first: int, rows: int, rng: np.r
     """Quantiles of the members' simulated y, with noise, in the rows from `first` on; (2, rows)."""
     paths = [
         free_run(model, data, first, rows)
-        + signal.lfilter([1.0], np.append(1.0, -model.a), model.sigma * rng.standard_normal((PATHS, rows)))
+        + scipy.signal.lfilter([1.0], np.append(1.0, -model.a), model.sigma * rng.standard_normal((PATHS, rows)))
         for model in models.members
     ]
     return np.quantile(np.concatenate(paths), SPREAD, axis=0)
@@ -167,8 +167,8 @@ def _excitation(data: RecordedData, settled: int) -> tuple[np.ndarray, np.ndarra
     segment = min(max(4 * settled, 32), len(data.time) // 8)
     rate = 1.0 / data.step
     with np.errstate(invalid="ignore", divide="ignore"):
-        frequency, coherence = signal.coherence(data.r_tilde, data.y, rate, nperseg=segment)
-    power = signal.welch(data.r_tilde, rate, nperseg=segment)[1]
+        frequency, coherence = scipy.signal.coherence(data.r_tilde, data.y, rate, nperseg=segment)
+    power = scipy.signal.welch(data.r_tilde, rate, nperseg=segment)[1]
     return frequency[1:], np.nan_to_num(coherence[1:]), power[1:]
 
 

@@ -357,14 +357,16 @@ class Loop:
 
 @jax.jit
 def judged(kept: jax.Array, incumbent: jax.Array, candidate: jax.Array, changed: jax.Array) -> jax.Array:
-    """By how many standard errors fallback and candidate are better than what acts; 0 for one that is worse somewhere.
+    """By how many standard errors fallback and candidate are better than what acts; (2,).
+
+    0 for a candidate that is worse in some kind of reference; the fallback, which is known, takes back by the mean.
 
     Args:
         kept, incumbent, candidate: mean rewards of blocks (B,).
         changed: share of the steps of each in which r changed.
     """
     found = gate.judge(jnp.stack([kept, candidate]) - incumbent[None], gate.kind(changed))
-    return jnp.where(found.better, found.gain / jnp.maximum(found.error, 1e-12), 0.0)
+    return jnp.where(found.better | np.array([True, False]), found.gain / jnp.maximum(found.error, 1e-12), 0.0)
 
 
 def run(

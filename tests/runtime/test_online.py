@@ -15,7 +15,7 @@ from jaxouter.loop import references
 from jaxouter.loop.policy import affine
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.runtime.online import Live, declared
-from jaxouter.runtime.realtime import Loop, StepError, Timing, run
+from jaxouter.runtime.realtime import SURE, Loop, StepError, Timing, judged, run
 from jaxouter.training.trainer import FIELDS, build
 from tests.load import load
 from tests.precision import of_single_draws
@@ -235,6 +235,14 @@ def test_only_a_candidate_that_is_better_on_the_same_steps_takes_over(learned):
         assert rows[-1].why == ("learned" if accepted else "static")
         if accepted:
             chex.assert_trees_all_equal(again.state.incumbent, candidate)
+
+
+def test_the_fallback_takes_back_by_the_mean_and_a_candidate_must_be_worse_nowhere():
+    changed = np.asarray(5 * [0.0, 0.05])
+    better = np.where(changed == 0.0, -0.1, 1.0) + np.linspace(0.0, 0.01, 10)
+    of_kept, of_candidate = judged(better, np.zeros(10), better, changed)
+    assert of_kept > SURE
+    assert of_candidate == 0.0
 
 
 def test_a_record_that_tells_nothing_leaves_r_as_it_is():

@@ -151,6 +151,7 @@ def test_a_run_may_end_with_the_start(config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, finals[0].agent.actor, again[0].agent.actor)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_keeps_the_row_of_the_start(config, tmp_path):
     longer = replace(config, steps=2_560)
     run = RunFolder.create(longer, tmp_path / "run")

@@ -14,8 +14,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
-from scipy.optimize import linprog
+import scipy
 
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
@@ -98,7 +97,7 @@ def plan(scenario: Scenario) -> Plan:
 
 def _responses(
     scenario: Scenario, probe: np.ndarray, moved: np.ndarray, size: np.ndarray, finite: np.ndarray
-) -> tuple[list[sp.csr_array], np.ndarray]:
+) -> tuple[list[scipy.sparse.csr_array], np.ndarray]:
     """G (T, T) of each kind of episode, and the number of its kind for each episode.
 
     Episodes whose simulated response to the probe agrees with the same G are of one kind.
@@ -123,7 +122,7 @@ def _responses(
                 f"prediction by {error:.3g} {scenario.plant.y_unit}); the clairvoyant bound exists for such plants only"
             )
         which[alike] = len(responses)
-        responses.append(sp.csr_array(np.where(np.abs(G) > NEGLIGIBLE * np.abs(G).max(), G, 0.0)))
+        responses.append(scipy.sparse.csr_array(np.where(np.abs(G) > NEGLIGIBLE * np.abs(G).max(), G, 0.0)))
     return responses, which
 
 
@@ -150,7 +149,7 @@ def _jacobian(plant: Plant, params: Any, change: Any, base: jax.Array) -> jax.Ar
 
 
 def _solve(
-    plant: Plant, G: sp.csr_array, y0: float, y_base: np.ndarray, r: np.ndarray
+    plant: Plant, G: scipy.sparse.csr_array, y0: float, y_base: np.ndarray, r: np.ndarray
 ) -> tuple[np.ndarray, float, float]:
     """r~ (T,), MAE and largest excess of one episode.
 
@@ -159,7 +158,7 @@ def _solve(
     """
     steps, unit = len(r), plant.error_scale  # the solver's tolerances are absolute
     y0, y_base, r = y0 / unit, y_base / unit, r / unit
-    eye, none = sp.eye_array(steps), sp.csr_array((steps, steps))
+    eye, none = scipy.sparse.eye_array(steps), scipy.sparse.csr_array((steps, steps))
     rows, bounds = [], []
     for limit, change, start in _limits(plant, steps, y0):
         rows += [[none, -change, change, -eye], [none, change, -change, -eye]]  # change @ y - start within the limit
@@ -167,25 +166,27 @@ def _solve(
     u_bound = (plant.r_tilde_bounds[1] - plant.r_tilde_bounds[0]) / 2 / unit
     program = dict(
         c=np.repeat([0.0, 1.0, 1.0, PRICE], steps),
-        A_eq=sp.block_array([[G, eye, -eye, none]], format="csr"),
+        A_eq=scipy.sparse.block_array([[G, eye, -eye, none]], format="csr"),
         b_eq=r - y_base,
-        A_ub=sp.block_array(rows, format="csr") if rows else None,
+        A_ub=scipy.sparse.block_array(rows, format="csr") if rows else None,
         b_ub=np.concatenate(bounds) if bounds else None,
         bounds=np.repeat([[-u_bound, u_bound], [0.0, np.inf], [0.0, np.inf], [0.0, np.inf]], steps, axis=0),
     )
-    result = linprog(**program, method="highs-ds")  # the interior-point method fails on some of these
+    result = scipy.optimize.linprog(**program, method="highs-ds")  # the interior-point method fails on some of these
     if result.x is None:
         raise RuntimeError(f"the linear program of the clairvoyant plan was not solved: {result.message}")
     u, p, n, s = unit * result.x.reshape(4, steps)
     return u + sum(plant.r_tilde_bounds) / 2, float(np.mean(p + n)), float(s.max())
 
 
-def _limits(plant: Plant, steps: int, y0: float) -> list[tuple[float, sp.csr_array, np.ndarray]]:
+def _limits(plant: Plant, steps: int, y0: float) -> list[tuple[float, scipy.sparse.csr_array, np.ndarray]]:
     """Each limit as (limit, M, start): |M y - start| <= limit, y (steps,); all in error scales."""
     limits = []
     if plant.output_limit is not None:
-        limits.append((plant.output_limit / plant.error_scale, sp.eye_array(steps, format="csr"), np.zeros(steps)))
+        limits.append(
+            (plant.output_limit / plant.error_scale, scipy.sparse.eye_array(steps, format="csr"), np.zeros(steps))
+        )
     if plant.rate_limit is not None:
-        difference = (sp.eye_array(steps) - sp.eye_array(steps, k=-1)).tocsr()
+        difference = (scipy.sparse.eye_array(steps) - scipy.sparse.eye_array(steps, k=-1)).tocsr()
         limits.append((plant.rate_limit / plant.error_scale, difference, np.eye(steps)[0] * y0))
     return limits

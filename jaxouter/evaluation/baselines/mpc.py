@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import numpy as np
-import scipy.linalg
+import scipy
 
 from jaxouter.evaluation.baselines.qp import Condensed, Solver, blocks, differences, limit_rows
 from jaxouter.evaluation.baselines.tuning import Report, coordinate_search, learners_episodes, score

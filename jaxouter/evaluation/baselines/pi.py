@@ -9,7 +9,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
+import scipy
 
 from jaxouter.evaluation.baselines.tuning import Report, learners_episodes, score
 from jaxouter.evaluation.cache import Tuned

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import osqp
-import scipy.sparse as sparse
+import scipy
 
 from jaxouter.plants import Plant
 
@@ -74,15 +74,15 @@ class Solver:
         self.law = -np.linalg.solve(qp.H, qp.F)
         moves, rows = len(qp.H), len(qp.rows_bound)
         # The variables are u and, where there are limits, an excess for each row.
-        H = sparse.block_diag([sparse.csc_matrix(qp.H), SOFT * sparse.eye(rows)], format="csc")
-        bounds = sparse.hstack([sparse.eye(moves), sparse.csc_matrix((moves, rows))])
-        limits = sparse.hstack([sparse.csc_matrix(qp.rows_forced), sparse.eye(rows)])
+        H = scipy.sparse.block_diag([scipy.sparse.csc_matrix(qp.H), SOFT * scipy.sparse.eye(rows)], format="csc")
+        bounds = scipy.sparse.hstack([scipy.sparse.eye(moves), scipy.sparse.csc_matrix((moves, rows))])
+        limits = scipy.sparse.hstack([scipy.sparse.csc_matrix(qp.rows_forced), scipy.sparse.eye(rows)])
         self._low, self._high = np.full(moves, qp.low), np.full(moves, qp.high)
         self._osqp = osqp.OSQP()
         self._osqp.setup(
-            P=sparse.triu(H, format="csc"),
+            P=scipy.sparse.triu(H, format="csc"),
             q=np.zeros(moves + rows),
-            A=sparse.vstack([bounds, limits], format="csc"),
+            A=scipy.sparse.vstack([bounds, limits], format="csc"),
             l=np.concatenate([self._low, -qp.rows_bound]),
             u=np.concatenate([self._high, qp.rows_bound]),
             verbose=False,

@@ -27,6 +27,7 @@ def error(policy, params) -> float:
     return mae(rollout(policy, params, training_episodes(*lag.make(), jax.random.key(1))))
 
 
+@pytest.mark.slow
 def test_the_exact_law_is_no_worse_than_that_of_a_record():
     plant, params = lag.make()
     found, history = exact.law(plant, params, KEY)
