@@ -62,8 +62,8 @@ def ours(options: tuple[str, ...], seed: int, below: float, seconds: float) -> I
         environment = os.environ | {"XDG_CACHE_HOME": str(Path(folder) / "cache"), "PYTHONPATH": str(HERE.parent)}
         metrics, seen = Path(folder) / "run" / f"seed-{seed}" / "metrics.jsonl", 0
         begun = time.perf_counter()
-        quiet = subprocess.DEVNULL
-        with subprocess.Popen(command, cwd=folder, env=environment, stdout=quiet, stderr=quiet) as process:
+        nowhere = subprocess.DEVNULL
+        with subprocess.Popen(command, cwd=folder, env=environment, stdout=nowhere, stderr=nowhere) as process:
             while process.poll() is None and time.perf_counter() - begun < seconds:
                 time.sleep(0.05)
                 rows = metrics.read_text().splitlines()[seen:] if metrics.exists() else []

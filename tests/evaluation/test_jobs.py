@@ -126,7 +126,7 @@ def own_world(tmp_path, monkeypatch):
 
 @pytest.fixture
 def own(tmp_path):
-    """Contenders of a user's file, by class."""
+    """Entrants of a user's file, by class."""
     path = tmp_path / "own.py"
     path.write_text(OWN)
     return lambda name: Entrant(f"own.py:{name}", "user", str(path), None, name)

@@ -164,10 +164,10 @@ def test_place_of_a_scenario_among_the_plants_of_a_training(name, ranges, noise,
 
 
 def test_set_points_over_the_range_are_held_long_without_disturbance_and_with_noise_where_named():
-    quiet, noisy = (scenarios.get(f"heaters/{name}") for name in ("rest", "rest-noise"))
-    assert quiet.r.shape == (19, 1_200)
-    np.testing.assert_allclose(quiet.r[:, [0, -1]], np.linspace(15.0, 25.0, 19)[:, None] * np.ones(2), rtol=1e-6)
-    assert float(quiet.params.house.sigma.max()) == 0.0
-    assert float(quiet.sensor.noise) == 0.0
+    silent, noisy = (scenarios.get(f"heaters/{name}") for name in ("rest", "rest-noise"))
+    assert silent.r.shape == (19, 1_200)
+    np.testing.assert_allclose(silent.r[:, [0, -1]], np.linspace(15.0, 25.0, 19)[:, None] * np.ones(2), rtol=1e-6)
+    assert float(silent.params.house.sigma.max()) == 0.0
+    assert float(silent.sensor.noise) == 0.0
     assert float(noisy.sensor.noise) == pytest.approx(0.06)
     assert not {"heaters/rest", "heaters/rest-noise"} & set(scenarios.reported("heaters"))

@@ -77,7 +77,7 @@ def test_an_actor_for_many_plants_beats_the_static_prefilter_on_them(config):
 
 
 @pytest.mark.slow
-def test_episodes_longer_than_the_plants_are_recorded_and_rehearsed_last(config, monkeypatch):
+def test_episodes_longer_than_the_plants_are_recorded_and_pretrained_on_last(config, monkeypatch):
     lengths, learn = [], DifferentiableRollout.train
     monkeypatch.setattr(
         DifferentiableRollout,
@@ -118,15 +118,15 @@ def test_costs_count_by_their_logarithm_where_asked(config):
     white = Whitening(np.zeros(trainer.env.observer.size), np.eye(trainer.env.observer.size))
 
     def cost(log_above):
-        school = DifferentiableRollout(TrainingEpisodes(of_record), trainer.policy, 1, log_above)
+        rollout = DifferentiableRollout(TrainingEpisodes(of_record), trainer.policy, 1, log_above)
         return -float(
-            school.train((actors, jax.vmap(ADAM.init)(actors)), white, base, model, np.zeros(1), KEY)[1][0, 0]
+            rollout.train((actors, jax.vmap(ADAM.init)(actors)), white, base, model, np.zeros(1), KEY)[1][0, 0]
         )
 
     assert cost(0.1) == pytest.approx(0.1 * np.log1p(cost(0.0) / 0.1), rel=1e-4)
 
 
-def test_rehearsed_disturbances_are_what_they_are_said_to_be(config):
+def test_disturbances_of_the_pretraining_are_what_they_are_said_to_be(config):
     trainer, _ = build(config)
     episodes = TrainingEpisodes(trainer.env.plant, Disturbances(0.5, 0.5))
     keys = jax.random.split(jax.random.key(0), 400)
