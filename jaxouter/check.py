@@ -19,6 +19,7 @@ from jaxouter.evaluation import figures
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.identification import recorded_data, steady_state, validation
 from jaxouter.plants import Plant, interface, simulate
+from jaxouter.plants.base import in_words
 from jaxouter.plants.registry import add
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.progress import showing
@@ -97,7 +98,7 @@ def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:
     choice = choose(preset(plant.name))
     lines = [
         *steady(plant, found),
-        ("set-points", f"{plant.setpoint_range[0]:.3g} to {plant.setpoint_range[1]:.3g} {plant.y_unit}"),
+        ("set-points", f"{plant.setpoint_range[0]:.3g} to {plant.setpoint_range[1]:.3g}{in_words(plant.y_unit)}"),
         ("dead time", f"{dead_time(responses)} control steps of {plant.control_step:g} {plant.time_unit}"),
         *([] if choice.said is None else [("training", choice.said)]),
     ]
@@ -117,14 +118,14 @@ def within_reach(plant: Plant, found: steady_state.DcGain) -> list[float]:
 
 def steady(plant: Plant, found: steady_state.DcGain) -> list[tuple[str, str]]:
     """Rows on the steady state of y, or on what y does instead of settling."""
-    unit = plant.y_unit
+    unit = in_words(plant.y_unit)
     if found.unsettled is not None:
-        change = f"by {found.rate:.3g} {unit} a control step for each {unit} of r~ beyond {found.still:.3g}"
+        change = f"by {found.rate:.3g}{unit} a control step for each 1{unit} of r~ beyond {found.still:.3g}{unit}"
         return [("DC gain", f"none, {found.unsettled.partition(': ')[2]}"), ("y changes late", change)]
     low, high = within_reach(plant, found)
     return [
-        ("DC gain", f"{float(found.gain):.3g}, y = {float(found.offset):.3g} {unit} at r~ = 0"),
-        ("y within reach", f"{low:.3g} to {high:.3g} {unit}"),
+        ("DC gain", f"{float(found.gain):.3g}, y = {float(found.offset):.3g}{unit} at r~ = 0"),
+        ("y within reach", f"{low:.3g} to {high:.3g}{unit}"),
     ]
 
 

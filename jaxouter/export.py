@@ -13,6 +13,7 @@ from jaxouter import cli
 from jaxouter.api import Run, load
 from jaxouter.exports import files
 from jaxouter.exports.files import FORMATS
+from jaxouter.plants.base import in_words
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     spec = run.policy.spec
     low, high = spec.r_tilde_bounds
     print(
-        f"{spec.plant}, seed {run.seed}: r~ in [{low:g}, {high:g}] {spec.y_unit} from r and y in {spec.y_unit}, once "
-        f"every {spec.control_step:g} {spec.time_unit}; state: {spec.history} past y, {spec.history} past r~, integral"
+        f"{spec.plant}, seed {run.seed}: r~ in [{low:g}, {high:g}]{in_words(spec.y_unit)} from r and y"
+        f"{in_words(spec.y_unit, ' in {}')}, once every {spec.control_step:g} {spec.time_unit}; state: "
+        f"{spec.history} past y, {spec.history} past r~, integral"
     )
     for path in files.written(out):
         print(f"written: {path} ({path.stat().st_size / 1000:.1f} kB)")

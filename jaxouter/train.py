@@ -20,6 +20,7 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import FiguresOfMerit, number
 from jaxouter.evaluation.policies import TrainingSummary
+from jaxouter.plants.base import in_words
 from jaxouter.plants.registry import add
 from jaxouter.progress import showing
 from jaxouter.tasks.presets import implied
@@ -178,7 +179,7 @@ def show(summary: TrainingSummary, config: TrainConfig) -> None:
         rows.append([*row, *([printed] if of_paper else []), ours, improvement])
     columns = ["scenario", *(["plant"] if placed else []), *(SIMPLE[each] for each in SIMPLE if each in by_name)]
     columns += [*(["paper's DRL"] if of_paper else []), "ours", "improvement, %"]
-    cli.table(f"MAE in {plants.make(config.plant)[0].y_unit}", columns, rows)
+    cli.table("MAE" + in_words(plants.make(config.plant)[0].y_unit, " in {}"), columns, rows)
     if placed:
         print("plant: where it lies among those of the training")
 

@@ -1,11 +1,13 @@
 """The check of a plant as users call it."""
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from jaxouter import check, plants
+from jaxouter.identification.steady_state import DcGain
 from jaxouter.plants import registry
 from tests import lag, recorded
 from tests.load import ROOT
@@ -27,6 +29,13 @@ def test_a_plant_that_implements_the_interface(tmp_path, capsys):
     assert out.count("implemented") == 5
     assert "DC gain" in out
     assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("unit", "text"), [("1", "0.5, y = 0 at r~ = 0"), ("bar", "0.5, y = 0 bar at r~ = 0")])
+def test_a_unit_is_shown_where_there_is_one(unit, text):
+    plant, _ = lag.make()
+    found = DcGain(np.asarray(0.5), np.asarray(0.0))
+    assert dict(check.steady(replace(plant, y_unit=unit), found))["DC gain"] == text
 
 
 def test_dead_time_and_gain_of_the_lag():

@@ -36,6 +36,7 @@ from jaxouter.evaluation.verdict import judge
 from jaxouter.loop import rewards
 from jaxouter.loop.policy import Linear
 from jaxouter.plants import Plant, base, make, slug
+from jaxouter.plants.base import in_words
 from jaxouter.plants.errors import PlantError
 from jaxouter.plants.registry import REGISTRATIONS, Maker, add, own_errors
 from jaxouter.plants.simulators import PlantOptions
@@ -346,8 +347,7 @@ class Learning:
             return ""
         every = self._maes.items() if len(self._done) > 1 else ()
         found = ", ".join(f"seed {seed} {mae}" for seed, mae in sorted(every)) or next(iter(self._maes.values()))
-        unit = "" if self._plant.y_unit == "1" else f" {self._plant.y_unit}"
-        return f"MAE {found}{unit} on {self._watched}"
+        return f"MAE {found}{in_words(self._plant.y_unit)} on {self._watched}"
 
 
 def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, episodes: int | None) -> None:
@@ -431,7 +431,7 @@ def draw(
     levels = {name: value for name, value in maes.items() if value is not None}
     levels |= {"paper's DRL": selected[0].paper[1]} if selected[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
-    title = f"{selected[0].id}, MAE [{selected[0].plant.y_unit}]"
+    title = f"{selected[0].id}, MAE" + in_words(selected[0].plant.y_unit, " [{}]")
     if run.config.epochs:
         figures.save(figures.learning_curve(rows, levels, title), run.figures / "learning-curve.png")
         drawn()

@@ -17,6 +17,7 @@ from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario, reported
 from jaxouter.evaluation.statistics import Line, lines, on_grid, scenarios
 from jaxouter.loop.references import FAMILIES
+from jaxouter.plants.base import in_words
 from jaxouter.tasks import Axis
 
 
@@ -274,7 +275,7 @@ def _ratios(content: SweepErrors, name: str) -> _Ratios:
 
 
 def _axis_label(axis: Axis) -> str:
-    return axis.name if axis.unit in ("", "1") else f"{axis.name} [{symbol(axis.unit)}]"
+    return axis.name + in_words(symbol(axis.unit), " [{}]")
 
 
 def _curves(content: SweepErrors, look: Mapping[str, Style]) -> Figure:

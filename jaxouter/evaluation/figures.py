@@ -15,6 +15,7 @@ from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.identification.validation import COHERENT, Validation
 from jaxouter.plants import Plant
+from jaxouter.plants.base import in_words
 
 INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#d1701f", "#b3261e"
 UNITS = {"degC": "°C"}
@@ -254,7 +255,7 @@ def live(steps: Mapping[str, np.ndarray], unit: str = "1") -> Figure:
     """
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     grid = figure.subplots(2, 2, sharex="col", sharey="row", squeeze=False)
-    told = "" if unit in ("", "1") else f" [{symbol(unit)}]"
+    told = in_words(symbol(unit), " [{}]")
     for column, (title, shown) in enumerate((("beginning", slice(LIVE_ROWS)), ("end", slice(-LIVE_ROWS, None)))):
         t, r, y, r_tilde, passed = (steps[name][shown] for name in ("time", "r", "y", "r_tilde", "y_passed"))
         above, below = grid[:, column]
@@ -283,7 +284,7 @@ def log_report(report: Validation, title: str, y_unit: str = "1", time_unit: str
     """
     figure = Figure(figsize=(10, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 3)
-    unit = "" if y_unit in ("", "1") else f" [{symbol(y_unit)}]"
+    unit = in_words(symbol(y_unit), " [{}]")
     _held_out(figure.add_subplot(grid[0, :]), report, unit, time_unit)
     _step_responses(figure.add_subplot(grid[1, 0]), report, time_unit)
     _levels(figure.add_subplot(grid[1, 1]), report, unit)

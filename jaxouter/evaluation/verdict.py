@@ -16,7 +16,7 @@ from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
 from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import Plant
-from jaxouter.plants.base import RUN_ONCE
+from jaxouter.plants.base import RUN_ONCE, in_words
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 ON_HOST = 4  # episodes of a plant that is simulated elsewhere, and may be slow
@@ -98,7 +98,7 @@ def _text(
     def told(value: float) -> str:
         return f"{value:.3g}" if np.isfinite(value) else "diverged"
 
-    unit = "" if unit in ("", "1") else f" in {unit}"
+    unit = in_words(unit, " in {}")
     others = ", ".join(f"{name} {told(value)}" for name, value in found.items())
     ours = ", ".join(told(of_seeds[seed]) for seed in (worse or of_seeds))
     on = f"on {count} fresh training episodes"

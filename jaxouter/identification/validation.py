@@ -11,6 +11,7 @@ import scipy
 from jaxouter.identification.linear_models import gain, settling, step_response
 from jaxouter.identification.recorded_data import Ensemble, RecordedData, free_run, without_last_quarter
 from jaxouter.plants.arx import Model
+from jaxouter.plants.base import in_words
 
 Intervals = tuple[tuple[float, float], ...]
 
@@ -244,7 +245,7 @@ def _warnings(it: Validation) -> list[str]:
 
 def table(found: Validation, y_unit: str = "1", time_unit: str = "s") -> list[tuple[str, str]]:
     """The validation as rows of a table: quantity, value."""
-    y, t = "" if y_unit in ("", "1") else f" {y_unit}", time_unit
+    y, t = in_words(y_unit), time_unit
     low, high = found.gain_range
     return [
         ("rows", f"{found.rows} of {found.control_step:.3g} {t}, {found.length:.3g} settling times"),

@@ -143,6 +143,11 @@ class Plant:
         return (self.start or self.init)(key, params)
 
 
+def in_words(unit: str, form: str = " {}") -> str:
+    """A unit within a text, such as ' crad', or ' in crad' by another form; '' for that of plain numbers, '' or '1'."""
+    return "" if unit in ("", "1") else form.format(unit)
+
+
 def parameters(params: Any, change: tuple[jax.Array, Any] | None, k: jax.Array) -> Any:
     """The plant's parameters at step k; from step `change[0]` on they are `change[1]`."""
     if change is None:
