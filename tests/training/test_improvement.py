@@ -100,7 +100,6 @@ def test_in_the_end_the_base_law_remains_where_what_was_learned_is_worse(started
         chex.assert_trees_all_equal(after.agent.actor, jax.tree.map(lambda leaf, kept=kept: kept * leaf, actor))
 
 
-@pytest.mark.slow
 def test_before_the_rounds_a_pretrained_actor_is_kept_only_where_it_is_better_than_the_base_law(tmp_path):
     start = PretrainingConfig(gradient_steps=2, episodes=2, batch_size=2)
     run = RunFolder.create(replace(CONFIG, steps=0, pretraining=start), tmp_path / "run")
