@@ -49,7 +49,7 @@ def test_no_gain_is_shown_where_there_is_none():
     assert (gain, none) == ("DC gain", "none, y keeps growing")
     assert change == "by 0.04 a control step for each 1 of r~ beyond 0.5"
     settled = check.steady(plant, found._replace(unsettled=None))
-    assert settled[0][1].startswith("3.8, y = 0 1")
+    assert settled[0][1].startswith("3.8, y = 0 at r~ = 0")
 
 
 def test_static_says_that_it_is_none_also_from_the_cache():
