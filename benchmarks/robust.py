@@ -16,8 +16,8 @@ from statistics import median
 import msgspec
 import numpy as np
 import tyro
-from comparison import show
 from msgspec import Struct
+from tables import table
 
 from jaxouter import cli
 from jaxouter.evaluation import cache, scenarios
@@ -98,11 +98,11 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
 
     print(f"\n{plant}, {about['date']}: MAE (ratio to its limit), share held\n")
     rows = [[s.id, places[s.id], *(cell(row[s.id], started[LIMIT][s.id]) for row in started.values())] for s in plants]
-    show(["plant", "of the drawn ones", *started], rows)
+    print(table(["plant", "of the drawn ones", *started], rows))
     print("\nMAE on all scenarios\n")
     pairs = [(s.id, [asked[name][s.id].mae or np.inf for name in (LEARNED, LIMIT)]) for s in catalogue]
     rows = [[name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs]
-    show(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows)
+    print(table(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
-from comparison import show
+from tables import made, table
 
 from jaxouter import cli
 from jaxouter.evaluation import cache, figures, scenarios
@@ -136,7 +136,7 @@ def main(
 ) -> None:
     """The command."""
     cache.use_compilation_cache()
-    table = []
+    found_rows = []
     for plant in plants:
         scenario = scenarios.get(scenarios.reported(plant)[0])
         found = curves(plant, runs)
@@ -151,15 +151,15 @@ def main(
             stays = {key: curve.half_below(level) for key, level in (("static", static), ("limit", NEAR * limit))}
             rows[name] = {"steps": curve.steps.tolist(), "mae": curve.mae.tolist(), "first": to, "median_stays": stays}
             cells = [f"{spread(to[key])}; {spread([stays[key]])}" for key in to]
-            table.append([scenario.id, name, *cells, f"{curve.median()[-1]:.3g} at {curve.steps[-1]:,.0f}"])
+            found_rows.append([scenario.id, name, *cells, f"{curve.median()[-1]:.3g} at {curve.steps[-1]:,.0f}"])
         about = {"date": date.today().isoformat(), "machine": surroundings(), "seeds": SEEDS, "scenario": scenario.id}
         write_json(RESULTS / f"sample-efficiency-{plant}.json", about | {"levels": levels, "presets": rows})
         title = f"{scenario.id}: MAE against control steps"
         draw(RESULTS / f"sample-efficiency-{plant}.png", found, levels, title, figures.symbol(scenario.plant.y_unit))
-    print("\nControl steps, median (least to greatest) of the seeds; and from which on the median stays there\n")
-    show(
-        ["scenario", "preset", "to beat static", f"to come within {NEAR - 1:.0%} of the limit", "MAE in the end"], table
-    )
+    columns = ["scenario", "preset", "to beat static", f"to come within {NEAR - 1:.0%} of the limit", "MAE in the end"]
+    written = f"{table(columns, found_rows)}\n\n{made('python benchmarks/sample_efficiency.py')}\n"
+    (RESULTS / "sample-efficiency.md").write_text(written)
+    print(written)
 
 
 if __name__ == "__main__":

@@ -16,17 +16,14 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
-from datetime import date
 from fnmatch import fnmatch
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import IO, Annotated, Any, Protocol
@@ -35,6 +32,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from tables import machine, table
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
@@ -274,28 +272,6 @@ def measure(cases: list[Case], yardsticks: list[Case], runs: int) -> tuple[dict[
     return measured, failed
 
 
-def machine() -> dict[str, Any]:
-    """What the figures depend on beside the code."""
-    info = Path("/proc/cpuinfo")
-    models = (
-        [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        if info.exists()
-        else []
-    )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    names = ("jax", "jaxlib", "numpy", "jaxouter")
-    return {
-        "cpu": models[0] if models else platform.processor() or platform.machine(),
-        "cores": cores,
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        **{name: version(name) for name in names},
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "load_before": round(os.getloadavg()[0], 2),
-        "date": date.today().isoformat(),
-    }
-
-
 def results(measured: dict[str, Measured], about: dict[str, Any]) -> dict[str, Any]:
     """The content of the JSON file."""
     rounds = {id(now): now for result in measured.values() for _, now in result.rounds}.values()
@@ -332,9 +308,8 @@ def headline(content: dict[str, Any]) -> str:
 
 def markdown(content: dict[str, Any]) -> str:
     """The table as a page."""
-    lines = [COLUMNS, ["---"] * len(COLUMNS), *map(cells, content["rows"])]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"# Throughput\n\n{headline(content)}\nWhat the figures mean: [README](../README.md).\n\n{table}\n"
+    rows = table(COLUMNS, map(cells, content["rows"]))
+    return f"# Throughput\n\n{headline(content)}\nWhat the figures mean: [README](../README.md).\n\n{rows}\n"
 
 
 def plot(content: dict[str, Any], path: Path) -> None:
@@ -418,10 +393,10 @@ def main(
         write(content, RESULTS / "throughput.json")
         (RESULTS / "throughput.md").write_text(markdown(content))
         plot(content, RESULTS / "throughput.png")
-    table = Table(*COLUMNS, title=headline(content), title_justify="left")
+    shown = Table(*COLUMNS, title=headline(content), title_justify="left")
     for row in content["rows"]:
-        table.add_row(*cells(row))
-    console.print(table)
+        shown.add_row(*cells(row))
+    console.print(shown)
     if failed:
         raise SystemExit(f"error: {len(failed)} of {len(chosen)} cases failed: {', '.join(failed)}")
 

@@ -40,10 +40,15 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Replace `{{ results }}` by the table of the paper's test cases, `{{ mae of POLICY on SCENARIO }}` by a number."""
+    """Fill in what is kept in benchmarks/results.
+
+    `{{ results }}` is the table of the paper's test cases, `{{ NAME.md }}` that file, `{{ mae of POLICY on SCENARIO }}`
+    a number.
+    """
     del page, config, files
     with_table = re.sub(r"\{\{ results \}\}", lambda _: results(), markdown)
-    return re.sub(r"\{\{ (\w+) of (\w+)\s+on\s+(\S+) \}\}", lambda match: figure(*match.groups()), with_table)
+    with_files = re.sub(r"\{\{ ([\w-]+\.md) \}\}", lambda match: (RESULTS / match[1]).read_text(), with_table)
+    return re.sub(r"\{\{ (\w+) of (\S+)\s+on\s+(\S+) \}\}", lambda match: figure(*match.groups()), with_files)
 
 
 class Comments(griffe.Extension):
@@ -106,11 +111,20 @@ def compared(plant: str) -> list[dict[str, str]]:
 def figure(merit: str, policy: str, scenario: str) -> str:
     """A metric in the comparison, median over the seeds.
 
+    Args:
+        merit: column.
+        policy: name, or the preset of a run.
+        scenario: id.
+
     Raises:
         ValueError: it is not in the comparison.
     """
-    kept = compared(scenario.split("/")[0])
-    values = [float(row[merit]) for row in kept if (row["policy"], row["scenario"]) == (policy, scenario)]
+    plant = scenario.split("/")[0]
+    values = [
+        float(row[merit])
+        for row in compared(plant)
+        if row["scenario"] == scenario and (row["policy"] == policy or f"{plant}-{policy}-" in row["run"])
+    ]
     if not values:
         raise ValueError(f"there is no {merit} of {policy} on {scenario} in {RESULTS}")
     return f"{median(values):.3g}"

@@ -10,6 +10,8 @@ ROOT = Path(__file__).parents[1]
 
 def load(folder: str, name: str) -> Any:
     """The module of a script, such as that of `benchmarks/slower.py`."""
+    if str(ROOT / folder) not in sys.path:
+        sys.path.append(str(ROOT / folder))  # a script imports what lies next to it
     spec = importlib.util.spec_from_file_location(f"{folder}_{name}", ROOT / folder / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
