@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 
 from jaxouter.identification import counterfactual
+from jaxouter.identification.counterfactual import CounterfactualParams
 from jaxouter.identification.records import Record
 from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.loop import rewards
@@ -202,6 +203,8 @@ def choose(
     disturbances: Disturbances,
     figure: Figure = "mae",
     on: Any = None,
+    models: Sequence[CounterfactualParams] | None = None,
+    prices: Sequence[float] = PRICES,
 ) -> Choice:
     """The best LQ law on held-out episodes of the records' own models.
 
@@ -221,16 +224,23 @@ def choose(
         figure: what is best.
         on: parameters of the plant, to compare the laws on the plant itself, whatever they do with measurement noise;
             None: on the record's own model.
+        models: other episodes on which they are compared than the last quarter of the record.
+        prices: of moves, to choose from.
     """
     whole = Record(*map(np.concatenate, zip(*data, strict=True)))
     steps, wanted = whole.r_tilde.shape[1], lags_for(plant, history)
     tried = [n for n in wanted if n < steps and len(whole.y) * (steps - n) >= 4 * n] or [1]
     most = max(tried) if tried != wanted else None
-    models = [counterfactual.fit(each, min(history, max(1, steps // 2))) for each in map(_finite, data) if len(each.y)]
+    if models is None:
+        fitted = min(history, max(1, steps // 2))
+        models = [counterfactual.fit(each, fitted) for each in map(_finite, data) if len(each.y)]
+        held_out = [jax.tree.map(lambda leaf: leaf[3 * len(leaf) // 4 :], model) for model in models]
+    else:
+        held_out = list(models)
     if not models:
         return Choice(static, None, np.inf, np.inf, most)
-    held_out = [jax.tree.map(lambda leaf: leaf[3 * len(leaf) // 4 :], model) for model in models]
-    settings, laws = zip(*_candidates(plant, whole, tried, NOISES if on is None else (0.0, *NOISES)), strict=True)
+    noises = NOISES if on is None else (0.0, *NOISES)
+    settings, laws = zip(*_candidates(plant, whole, tried, noises, prices), strict=True)
     numbers = LinearLaw(*map(np.stack, zip(*(_padded(each, max(tried)) for each in (static, *laws)), strict=True)))  # type: ignore[arg-type]
     together = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), numbers)
     if on is None:
@@ -271,14 +281,14 @@ def warn_short(plant: Plant, most: int | None) -> None:
 
 
 def _candidates(
-    plant: Plant, data: Record, lags: Sequence[int], noises: Sequence[float]
+    plant: Plant, data: Record, lags: Sequence[int], noises: Sequence[float], prices: Sequence[float]
 ) -> Iterator[tuple[Settings, LinearLaw]]:
     """The laws that are compared."""
     of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
     for n in lags:
         models = fits(data, n, [noise * of_y for noise in noises])
         for noise, (a, b) in zip(noises, models, strict=True):
-            for price in PRICES:
+            for price in prices:
                 yield Settings(n, noise, price), law(a, b, price * (of_y / of_r_tilde) ** 2)
 
 
@@ -286,13 +296,17 @@ def _candidates(
 def _compared(
     episodes: TrainingEpisodes, laws: LinearLaw, params: Any, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """MAE, mean reward, and share of steps outside the limits, of each law (G, ...); each (G,)."""
+    """MAE, mean reward, and share of steps outside the limits, of each law (G, ...); each (G,).
+
+    The MAE of an episode counts as the set-point range at most: where y may diverge, how often it does so counts.
+    """
     policy, plant = Linear(episodes.plant.r_tilde_bounds), episodes.plant
 
     def one(law: LinearLaw, key: chex.PRNGKey) -> tuple[jax.Array, ...]:
         seen = episodes.run(policy, law, params, key)
         outside = excess(plant, seen.y[1:], seen.y[:-1]) > 0.0
-        return jnp.mean(jnp.abs(seen.r - seen.y)), jnp.mean(seen.reward), jnp.mean(jnp.where(outside, 1.0, 0.0))
+        error = jnp.minimum(jnp.mean(jnp.abs(seen.r - seen.y)), float(np.ptp(plant.setpoint_range)))
+        return error, jnp.mean(seen.reward), jnp.mean(jnp.where(outside, 1.0, 0.0))
 
     of_all = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(laws, jax.random.split(key, EPISODES))
     mae, reward, outside = (jnp.mean(each, 1) for each in of_all)

@@ -50,9 +50,9 @@ def _episodes(plant: Plant, params: Any, keys: chex.PRNGKey) -> tuple[jax.Array,
     return jax.vmap(episode)(keys)
 
 
-def within(data: Record, bounds: tuple[float, float]) -> Record:
-    """The record with y replaced by nan from where it leaves the bounds by far."""
+def within(data: Record, bounds: tuple[float, float], beyond: float = 4.0) -> Record:
+    """The record with y replaced by nan from where it leaves the bounds by more than `beyond` times their range."""
     low, high = bounds
-    far = 4.0 * (high - low)
+    far = beyond * (high - low)
     gone = np.maximum.accumulate(~((data.y >= low - far) & (data.y <= high + far)), axis=1)
     return data._replace(y=np.where(gone, np.nan, data.y))

@@ -5,18 +5,30 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import numpy as np
 
-from jaxouter import plants, tasks
-from jaxouter.identification import dynamics, steady_state
+from jaxouter import agents, plants, tasks
+from jaxouter.identification import dynamics, steady_state, unstable
 from jaxouter.identification.dynamics import Dynamics
 from jaxouter.loop.observation import HISTORY
 from jaxouter.plants import Plant
-from jaxouter.training.config import PretrainingConfig, TrainConfig
+from jaxouter.training.config import PretrainingConfig, TrainConfig, preset, to_dict, with_options
 
 EXPLORATION = 3  # folded into a key
 ON_HOST = 4  # episodes on which actors are compared, on a plant that is simulated elsewhere
+
+
+UNSTABLE = {
+    "correction": 1.0,  # of a law that is kept from the bounds of r~ rather than good
+    "disturbances.noise": 0.006,
+    "disturbances.load": 0.0,
+    "pretraining.closed_loop": 128,
+    "pretraining.gradient_steps": 1_200,
+    "pretraining.log_above": 1.0,
+    "pairs.rounds": 0,
+}
 
 
 class Choice(NamedTuple):
@@ -46,6 +58,8 @@ def choose(config: TrainConfig) -> Choice:
         plant, params = plants.randomised(plant, params, config.randomise)
     key = jax.random.fold_in(jax.random.key(config.seed), EXPLORATION)
     found, steps = dynamics.explore(plant, params, key)
+    if all(one.kind == "unstable" for one in found) and plant.differentiable and not config.randomise:
+        return _unstable(config, plant, params, key, steps)
     if not any(one.shown for one in found):
         try:
             steady_state.dc_gain(plant, params, key)
@@ -57,6 +71,29 @@ def choose(config: TrainConfig) -> Choice:
         text = f"y of {plant.name} shows no effect of r~ above its noise in {steps:,} control steps; history stays"
         return Choice(replace(config, explored_steps=steps), None, (f"{text} {config.history or HISTORY}",))
     return fitted(config, plant, [one for one in found if one.shown], steps)
+
+
+def _unstable(config: TrainConfig, plant: Plant, params: Any, key: chex.PRNGKey, steps: int) -> Choice:
+    """The choice for a plant that diverges under random r~: it is held by the LQ law first, and then learned on."""
+    if config.base != "lq":
+        text = f"{plant.name} is unstable alone, which only training with --base lq can hold"
+        return Choice(replace(config, explored_steps=steps), None, (text,))
+    defaults = to_dict(preset(config.plant, config.preset, agents.name_of(config.agent)))
+    given = to_dict(config)
+    lags = unstable.lags(plant, params, key)
+    wanted = {**UNSTABLE, "pretraining.episode_steps": 2 * plant.episode_steps}
+    free = {name: value for name, value in wanted.items() if _of(given, name) == _of(defaults, name)}
+    steps += unstable.EPISODES * plant.episode_steps
+    config = with_options(replace(config, history=config.history or lags, explored_steps=steps), free)
+    said = f"identified: unstable alone; chosen: history {config.history}"
+    return Choice(config, f"{said}, {', '.join(f'{name} {value}' for name, value in free.items())}", ())
+
+
+def _of(values: Any, name: str) -> Any:
+    """The value of an option in nested dicts."""
+    for part in name.split("."):
+        values = values[part]
+    return values
 
 
 def _on_host(config: TrainConfig) -> TrainConfig:

@@ -39,6 +39,8 @@ class PretrainingConfig:
     """Length of a recorded episode in control steps, and of an episode on the model; None: the plant's episode."""
     lags: int | None = None
     """Past samples of r~ and y in the model; None: as in the observation, or more if the dead time needs them."""
+    closed_loop: int = 0
+    """Episodes recorded in closed loop, under the LQ law of those under random r~, if the plant is unstable alone."""
     batch_size: int = 64
     """Episodes on the model per gradient step."""
     log_above: float = 0.0
@@ -51,6 +53,8 @@ class PretrainingConfig:
             raise ValueError(f"pretraining.gradient_steps is {self.gradient_steps}; it must not be negative")
         if self.log_above < 0:
             raise ValueError(f"pretraining.log_above is {self.log_above}; it must not be negative")
+        if self.closed_loop < 0:
+            raise ValueError(f"pretraining.closed_loop is {self.closed_loop}; it must not be negative")
         for name in ("episodes", "plants", "episode_steps", "lags", "batch_size"):
             if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"pretraining.{name} is {getattr(self, name)}; it must be at least 1")
@@ -134,6 +138,11 @@ class TrainConfig:
         self.agent.check()
         if (self.pretraining.plants > 1) and not self.randomise:
             raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
+        if self.pretraining.closed_loop and (self.randomise or self.base != "lq"):
+            raise ValueError(
+                f"pretraining.closed_loop is {self.pretraining.closed_loop}; it must be 0 without --base lq, and with "
+                "--randomise"
+            )
         if self.pretraining.episodes % self.pretraining.plants:
             raise ValueError(
                 f"pretraining.episodes is {self.pretraining.episodes}; it must be a multiple of the "
@@ -213,7 +222,8 @@ class TrainConfig:
         plant, start = plants.make(self.plant)[0], self.pretraining
         if plant.identified:
             return 0
-        recorded = start.episodes * (start.episode_steps or plant.episode_steps) if self.records else 0
+        episodes = start.episodes + start.closed_loop
+        recorded = episodes * (start.episode_steps or plant.episode_steps) if self.records else 0
         levels = LEVELS * plant.episode_steps if self.base in ("static", "lq") else 0
         return self.explored_steps + recorded + levels
 

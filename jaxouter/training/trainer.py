@@ -19,8 +19,9 @@ from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.pairs import PairsLearner
 from jaxouter.agents.replay import Replay
-from jaxouter.identification import lq, steady_state
+from jaxouter.identification import counterfactual, lq, steady_state, unstable
 from jaxouter.identification.records import Record, within
+from jaxouter.identification.unstable import Identified
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.loop.episodes import TrainingEpisodes
@@ -100,7 +101,9 @@ class Trainer:
         key_record, *keys = jax.random.split(jax.random.fold_in(key_base, PRETRAINING), 3)
         of_plant = self.config.base == "lq" or not plant.identified
         data = recorded(start, plant, params.plant, key_record, say) if self.config.records and of_plant else []
-        state = state._replace(base=self._base(state.base, params, data, key_base, say))
+        found = self._unstable(params, data[0], key_base, say) if start.closed_loop else None
+        base = self._base(state.base, params, data, key_base, say) if found is None else found.law
+        state = state._replace(base=base)
         if not start.gradient_steps:
             return state
 
@@ -110,7 +113,10 @@ class Trainer:
         def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
             report(at, lambda: with_actor(actor()))
 
-        model, of_model = model_of(start, plant, params.plant, data, self.env.observer.history)
+        if found is None:
+            model, of_model = model_of(start, plant, params.plant, data, self.env.observer.history)
+        else:
+            model, of_model = counterfactual.plant(plant, self.env.observer.history), found.params
         episodes = TrainingEpisodes(model, self.config.disturbances, self.config.reward)
         learned, more = self.policy_params(state), (reported, begin, devices, say)
         return with_actor(pretrain(start, episodes, of_model, self.policy, learned, keys, *more))
@@ -133,6 +139,16 @@ class Trainer:
         found = lq.choose(plant, data, law, key_choose, self.env.observer.history, self.config.disturbances)
         lq.warn_short(plant, found.most)
         return padded(found.law if found.mae < found.static_mae else law, lags)
+
+    def _unstable(self, params: EnvParams, data: Record, key: chex.PRNGKey, say: Say) -> Identified:
+        """Base law and model of a plant that is unstable alone."""
+        say("recording", 0, 0)
+        plant, start, observer = self.env.plant, self.config.pretraining, self.env.observer
+        static = steady_state.static(plant, params.plant, key)[1]
+        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
+        of_law = jax.random.fold_in(key, BASE), observer.history, self.config.disturbances, static
+        found = unstable.identify(longer, params.plant, data, *of_law, start.closed_loop)
+        return found._replace(law=padded(found.law, observer.lags))
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
