@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -64,12 +65,12 @@ def evaluated(policies: Sequence[NamedPolicy], scenario: Scenario) -> Held:
     return Held(middle, worst, median(shares), min(shares))
 
 
-def cell(row: Held, limit: Held) -> str:
+def cell(row: dict[str, float | None], limit: dict[str, float | None]) -> str:
     """MAE, its ratio to the limit, and the share that is held."""
-    if row.mae is None:
+    if row["mae"] is None:
         return "diverged"
-    ratio = "" if limit.mae is None or row is limit else f" ({row.mae / limit.mae:.2f})"
-    return f"{row.mae:.3g}{ratio}, {100 * row.held:.0f} %"
+    ratio = "" if limit["mae"] is None or row is limit else f" ({row['mae'] / limit['mae']:.2f})"
+    return f"{row['mae']:.3g}{ratio}, {100 * (row['held'] or 0.0):.0f} %"
 
 
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
@@ -93,16 +94,29 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         "seeds": [seed for run in opened for seed in run.seeds],
     }
     about |= {"preset": config.preset, "ranges": config.randomise, "places": places}
-    found = msgspec.to_builtins({"perturbed": started, "scenarios": asked})
-    write_json(RESULTS / f"robust-{plant}.json", about | found)
+    found = about | msgspec.to_builtins({"perturbed": started, "scenarios": asked})
+    write_json(RESULTS / f"robust-{plant}.json", found)
+    text = written(found)
+    (RESULTS / f"robust-{plant}.md").write_text(text + "\n")
+    print(text)
 
-    print(f"\n{plant}, {about['date']}: MAE (ratio to its limit), share held\n")
-    rows = [[s.id, places[s.id], *(cell(row[s.id], started[LIMIT][s.id]) for row in started.values())] for s in plants]
-    print(table(["plant", "of the drawn ones", *started], rows))
-    print("\nMAE on all scenarios\n")
-    pairs = [(s.id, [asked[name][s.id].mae or np.inf for name in (LEARNED, LIMIT)]) for s in catalogue]
-    rows = [[name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs]
-    print(table(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows))
+
+def written(found: dict[str, Any]) -> str:
+    """The tables of a result: drawn starts, scenarios."""
+    started, asked, places = (found[key] for key in ("perturbed", "scenarios", "places"))
+    names = started[LIMIT]
+    rows = [[name, places[name], *(cell(row[name], names[name]) for row in started.values())] for name in names]
+    held = table(["plant", "of the drawn ones", *started], rows)
+    pairs = {name: [asked[each][name]["mae"] or np.inf for each in (LEARNED, LIMIT)] for name in asked[LIMIT]}
+    rows = [
+        [name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs.items()
+    ]
+    scenario = table(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows)
+    versions = found["machine"]["versions"]
+    when = (
+        f"Made on {found['date']} with jaxouter {versions['jaxouter']}, jax {versions['jax']}, seeds {found['seeds']}."
+    )
+    return f"{held}\n\n{scenario}\n\n{when}"
 
 
 if __name__ == "__main__":

@@ -433,15 +433,18 @@ def rows(done: Sequence[Done]) -> list[Row]:
 
 
 def limit(figures: Mapping[str, FiguresOfMerit]) -> float | None:
-    """The least MAE of the privileged policies of a scenario that leave the plant's limits no more than allowed.
+    """The least MAE that a policy which knows the plant reaches in a scenario, while it keeps the plant's limits.
 
-    Where all leave them, of those that do so least. None where there is none of them but `none` and `static`.
+    Where none of `LIMITS` keeps these, those count that leave them about as seldom as the best, and `none` and `static`
+    that do so no more often. A policy with a lower MAE that leaves them more often is no counter-example. None where
+    there is none of `LIMITS`.
     """
     if not any(name in figures for name in LIMITS):
         return None
-    known = [each for name, each in figures.items() if name in (*LIMITS, *SIMPLE) and each.mae is not None]
-    allowed = max(WITHIN, min((each.violation_time or 0.0 for each in known), default=0.0))
-    return min((each.mae or 0.0 for each in known if (each.violation_time or 0.0) <= allowed), default=None)
+    known = {name: figures[name] for name in (*LIMITS, *SIMPLE) if name in figures and figures[name].mae is not None}
+    outside = {name: each.violation_time or 0.0 for name, each in known.items()}
+    allowed = min((outside[name] for name in LIMITS if name in known), default=1.0) + WITHIN
+    return min((known[name].mae or 0.0 for name in known if outside[name] <= allowed), default=None)
 
 
 def first_episodes(done: Sequence[Done], on: str) -> dict[Entrant, Traces]:

@@ -62,6 +62,10 @@ class Model(NamedTuple):
         """Factor by which a deviation grows in a control step."""
         return float(np.abs(np.roots(np.append(1.0, -self.a))).max())
 
+    def response(self, steps: int) -> np.ndarray:
+        """Of y to a unit of r~ in the control step before the first; (steps,)."""
+        return np.asarray(scipy.signal.lfilter(self.b, np.append(1.0, -self.a), np.eye(1, steps)[0]))
+
 
 def lags(plant: Plant, params: Any, key: chex.PRNGKey) -> int:
     """Lags that a model needs: the least of `LAGS` whose predictions are about as good as the best."""
@@ -121,7 +125,7 @@ def _law(
     """The LQ law that suits the records best, and the episodes on their model that can be brought back."""
     model = fit(plant, data, history)
     replayed = continued(plant, data, model)
-    alive = can_be_brought_back(plant, replayed, model)
+    alive = can_be_brought_back(plant, replayed, model.response(plant.episode_steps))
     dead = int(np.argmax(np.abs(model.b) > NEGLIGIBLE * np.abs(model.b).max()))
     about = (
         f"{plant.name} is unstable alone: a deviation grows by {model.growth:.3g} in a control step, r~ acts after "
@@ -180,20 +184,24 @@ def _pushed(past: np.ndarray, new: np.ndarray) -> np.ndarray:
     return np.column_stack([new, past[:, :-1]])
 
 
-def can_be_brought_back(plant: Plant, replayed: Record, model: Model) -> np.ndarray:
-    """Whether some r~ within its bounds keeps y within its own until the end; (episodes,).
+def can_be_brought_back(plant: Plant, episodes: Record, response: np.ndarray) -> np.ndarray:
+    """Whether some r~ within its bounds would have had y within its own late in an episode; (episodes,).
 
-    A linear programme for each episode: the least excess of y over its bounds late in an episode, as the model has it.
+    A linear programme for each episode, of a plant that is linear but for the bounds.
+
+    Args:
+        plant: as declared.
+        episodes: under any r~, without bounds.
+        response: of y to a unit of r~ in the control step before the first; (T,).
     """
-    steps = replayed.r_tilde.shape[1]
+    steps = episodes.r_tilde.shape[1]
     late = np.arange(steps - max(1, round(LATE * steps)), steps)
-    response = scipy.signal.lfilter(model.b, np.append(1.0, -model.a), np.eye(1, steps)[0])
     at = late[:, None] - np.arange(steps)
     moved = np.where(at >= 0, response[np.maximum(at, 0)], 0.0)  # (late, steps), of y_(k+1) by r~
     low, high = plant.divergence_bounds
     unit = np.abs(moved).max(1, keepdims=True)  # the solver's tolerances are absolute
     found = []
-    for r_tilde, y in zip(replayed.r_tilde, replayed.y, strict=True):
+    for r_tilde, y in zip(episodes.r_tilde, episodes.y, strict=True):
         free = y[late + 1] - moved @ r_tilde
         program = scipy.optimize.linprog(
             np.zeros(steps),

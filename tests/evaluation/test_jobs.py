@@ -227,6 +227,7 @@ def test_rows_of_what_diverged():
         ({"oracle": (2.0, 0.0), "lq-exact": (1.5, 0.0), "static": (3.0, 0.0)}, 1.5),
         ({"oracle": (2.0, 0.0), "lq-exact": (1.5, 0.01), "static": (3.0, 0.0)}, 2.0),  # outside the limits
         ({"oracle": (2.0, 0.05), "lq-exact": (1.5, 0.01), "static": (3.0, 0.02)}, 1.5),  # all are; it is so least
+        ({"oracle": (2.0, 0.02), "lq-exact": (2.5, 0.01), "static": (3.0, 0.0)}, 2.5),  # static is not all there is
         ({"oracle": (2.0, None), "none": (1.0, None), "learned": (0.5, None)}, 1.0),  # the inner loop knows as much
         ({"static": (3.0, 0.0), "learned": (0.5, 0.0)}, None),  # none that is made from the true plant
     ],

@@ -58,7 +58,7 @@ def test_what_can_be_brought_back_is_what_the_bounds_of_r_tilde_allow(y0, back):
     y[1] = A * y0  # as long as the model's past
     alone = Record(np.zeros((1, kinds.EPISODE)), y[None])
     replayed = unstable.continued(plant, alone, model)
-    assert unstable.can_be_brought_back(plant, replayed, model).tolist() == [back]
+    assert unstable.can_be_brought_back(plant, replayed, model.response(kinds.EPISODE)).tolist() == [back]
 
 
 @pytest.mark.parametrize(("dead", "least"), [(0, 15), (25, 30)])

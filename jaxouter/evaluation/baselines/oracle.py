@@ -2,7 +2,7 @@
 
 The plants are differentiable, so the gradient of the cost is computed by back-propagation through whole episodes of the
 training distribution (analytic policy gradient). The cost is the error and what y exceeds the plant's limits by, at
-five times the reward's price. The network is the learner's, its history as long as that of the law. It reads the
+fifty times the reward's price: at five times it still left the heaters' comfort limit in 1.6 % of the hours. The network is the learner's, its history as long as that of the law. It reads the
 plant's equations, which no outer loop can. With `lq-exact` and `mpc-exact` it is the limit.
 """
 
@@ -42,7 +42,7 @@ STAGES = 3
 MOST = FIRST_STAGE * 2 ** (STAGES - 1)  # gradient steps
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
-ERROR = RewardConfig(beta_h=0.0, beta_b=0.0, delta_b=5.0)  # the error, and what is outside the limits
+ERROR = RewardConfig(beta_h=0.0, beta_b=0.0, delta_b=50.0)  # the error, and what is outside the limits
 DRAWN = 2048  # plants that are simulated beforehand
 VALIDATION = 512  # training episodes on which the best seed is chosen
 
