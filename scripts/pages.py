@@ -42,13 +42,18 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill in what is kept in benchmarks/results.
 
-    `{{ results }}` is the table of the paper's test cases, `{{ NAME.md }}` that file, `{{ mae of POLICY on SCENARIO }}`
-    a number.
+    `{{ results }}` is the table of the paper's test cases, `{{ NAME.md }}` that file without its title,
+    `{{ mae of POLICY on SCENARIO }}` a number.
     """
     del page, config, files
     with_table = re.sub(r"\{\{ results \}\}", lambda _: results(), markdown)
-    with_files = re.sub(r"\{\{ ([\w-]+\.md) \}\}", lambda match: (RESULTS / match[1]).read_text(), with_table)
+    with_files = re.sub(r"\{\{ ([\w-]+\.md) \}\}", lambda match: included(match[1]), with_table)
     return re.sub(r"\{\{ (\w+) of (\S+)\s+on\s+(\S+) \}\}", lambda match: figure(*match.groups()), with_files)
+
+
+def included(name: str) -> str:
+    """A file of benchmarks/results without its title."""
+    return re.sub(r"\A# .*\n+", "", (RESULTS / name).read_text()).rstrip()
 
 
 class Comments(griffe.Extension):

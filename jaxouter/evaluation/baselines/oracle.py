@@ -2,8 +2,9 @@
 
 The plants are differentiable, so the gradient of the cost is computed by back-propagation through whole episodes of the
 training distribution (analytic policy gradient). The cost is the error and what y exceeds the plant's limits by, at
-fifty times the reward's price: at five times it still left the heaters' comfort limit in 1.6 % of the hours. The network is the learner's, its history as long as that of the law. It reads the
-plant's equations, which no outer loop can. With `lq-exact` and `mpc-exact` it is the limit.
+fifty times the reward's price: at five times it left the heaters' comfort limit in 1.6 % of the hours. The network is
+the learner's, its history as long as that of the law. It reads the plant's equations, which no outer loop can. With
+`lq-exact` and `mpc-exact` it is the limit.
 """
 
 from __future__ import annotations
