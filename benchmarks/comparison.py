@@ -51,7 +51,7 @@ def answers(content: Comparison) -> Iterator[dict[str, str]]:
             **{f"`{preset(line.label)}`": shown(line) for line in lines if line.run is not None},
             "`lq`": shown(by_label["lq"]),
             "best other baseline": f"{shown(best)} (`{best.label}`)",
-            "limit": f"{limits[0]:.3g}" if limits else "",
+            "limit": f"{limits[0]:.3g}" if limits and scenarios.get(name, 1).stable_alone else "unknown",
         }
 
 
