@@ -16,6 +16,7 @@ from tests.recorded import recorded, write
 from tests.training.small import TINY
 
 TANKS = f"{ROOT}/scripts/examples/tanks.py:Tanks"
+LONG_PIPE = f"{ROOT}/scripts/examples/long_pipe.py:LongPipe"
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +37,17 @@ def test_a_plant_is_trained_and_evaluated_and_a_run_folder_imports_none(tmp_path
     del plants.REGISTRY["Tanks"], registry.REGISTRATIONS["Tanks"]
     with pytest.raises(ValueError, match="code is never imported because a run folder names it"):
         RunFolder.open(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_a_loop_that_is_unstable_alone_is_held(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    train.main([LONG_PIPE, "--out", "run", "--pretraining.gradient-steps", "20", "--pretraining.closed-loop", "16"])
+    assert "LongPipe: identified: unstable alone" in capsys.readouterr().out
+    results = json.loads((tmp_path / "run" / "summary.json").read_text())["results"]
+    maes = {each["policy"]: each["scenarios"]["LongPipe/steps"]["mae"] for each in results}
+    assert maes["none"] > 100.0
+    assert maes["learned"] < 0.3
 
 
 @pytest.mark.slow

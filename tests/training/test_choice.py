@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxouter import plants
+from jaxouter.identification import unstable
 from jaxouter.identification.dynamics import EXPLORED, Dynamics
 from jaxouter.plants import arx
 from jaxouter.plants.arx import Model
@@ -89,6 +90,19 @@ def test_a_plant_of_ones_own_is_explored_once_and_that_is_counted(monkeypatch: p
 
 def test_built_in_plants_stay_as_they_are() -> None:
     assert choose(DEFAULT) == (DEFAULT, None, ())
+
+
+def test_a_plant_that_diverges_is_held_first_and_what_is_given_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(plants.REGISTRY, "kind", kinds.kind([1.08], [0.04]))
+    given = replace(preset("kind"), correction=0.7)
+    choice = choose(given)
+    config = choice.config
+    assert (config.history, config.pretraining.episode_steps) == (15, 2 * kinds.EPISODE)
+    assert (config.correction, config.pairs.rounds, config.pretraining.closed_loop) == (0.7, 0, 128)
+    assert config.explored_steps == (EXPLORED + unstable.EPISODES) * kinds.EPISODE
+    assert config.identification_steps == config.explored_steps + (8 + 2 * (64 + 128)) * kinds.EPISODE
+    assert "identified: unstable alone; chosen: history 15" in (choice.said or "")
+    assert choose(replace(given, base="static")).warnings[0].endswith("which only training with --base lq can hold")
 
 
 def test_what_nothing_moves_is_refused_before_training(monkeypatch: pytest.MonkeyPatch) -> None:
