@@ -1,9 +1,10 @@
 """Identification of a plant that is unstable alone, from records that diverge.
 
 Episodes of random r~ count until y leaves the plant's bounds. A model of them gives an LQ law; under this law and a
-dither episodes last longer, and are recorded too. Each episode is then continued by the model, as it would have been
-under a law without bounds, so that what came of its start under any other r~ can be computed (`counterfactual`). Starts
-that no r~ within the bounds can bring back are left out: a linear programme on the model says which.
+dither episodes last longer, and those that stay within the bounds are recorded too. Each episode is then continued by
+the model, as it would have been under a law without bounds, so that what came of its start under any other r~ can be
+computed (`counterfactual`). Starts that no r~ within the bounds can bring back are left out: a linear programme on the
+model says which.
 """
 
 from __future__ import annotations
@@ -107,12 +108,15 @@ def identify(
     opened = within(data, plant.divergence_bounds, 0.0)
     law, _ = _law(plant, opened, key_law, history, disturbances, static)
     closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key_run, episodes))))
-    closed = within(closed, plant.divergence_bounds, 0.0)
-    both = Record(*(np.concatenate(each).astype(np.float64) for each in zip(opened, closed, strict=True)))
+    stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
+    # Starts that are hard to hold are among the others; more of them would outweigh how well y follows.
+    both = Record(
+        *(np.concatenate([one, two[stayed]]).astype(np.float64) for one, two in zip(opened, closed, strict=True))
+    )
     law, replayed = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
         f"{plant.name} is unstable alone; {len(replayed.y)} of {len(both.y)} recorded starts can be brought back, and "
-        f"{int(np.isfinite(closed.y).all(1).sum())} of {episodes} episodes under the LQ law stayed within bounds",
+        f"{stayed.sum()} of {episodes} episodes under the LQ law stayed within bounds",
         IdentificationWarning,
         stacklevel=2,
     )
