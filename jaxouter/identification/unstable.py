@@ -22,6 +22,7 @@ import scipy
 
 from jaxouter.identification import lq
 from jaxouter.identification.counterfactual import CounterfactualParams
+from jaxouter.identification.dynamics import NEGLIGIBLE
 from jaxouter.identification.linear_models import fit_arx, prediction_error
 from jaxouter.identification.records import Record, record, within
 from jaxouter.identification.steady_state import IdentificationWarning
@@ -40,7 +41,6 @@ NOISE = 6e-3  # standard deviation in the fit; 1 is half the set-point range
 PRICES = (*lq.PRICES, 10**2.5, 10.0**3)  # of moves: a law that moves r~ less is at its bounds less often
 INSIDE = 0.8  # share of the set-point range in closed loop
 DITHER, RATE = 1 / 12, 0.2  # of half the range of r~; redraws per control step
-NEGLIGIBLE = 0.01  # of the largest coefficient of r~; leading ones below are dead time
 LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 
 
