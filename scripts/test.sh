@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Lint, types and tests, in under 9 minutes on 2 cores, set-up aside.
-# --all, under 120 minutes: all tests as users compile, the slow ones too, all others in double precision, all but plants
-# and loop with checks for NaN, places broken on purpose, 20 kills, run folders of the version that made them, the wheel in
-# an environment of its own, the default suite on a second Python, the code blocks of the documentation, and
+# --all, under 120 minutes: all tests as users compile, the default suite by a second Python, the slow ones by this one; the
+# default suite in double precision, all but plants and loop with checks for NaN; places broken on purpose, 20 kills, run
+# folders of the version that made them, the wheel in an environment of its own, the code blocks of the documentation, and
 # stable-baselines3 and rejax on our environments (6 GB the first time, see peers.sh).
 # --all WORDS: of these parts only those whose titles hold the words. What came out of each the last time is in
 # benchmarks/results/tests.md. Other arguments go to pytest, and nothing else is tested then.
@@ -24,18 +24,18 @@ rejax() {  # gymnax itself on our environment too
     "$python" -m pytest tests/loop/test_spaces.py tests/runtime/test_gymnax.py || return
     PYTHONPATH=$root "$python" scripts/examples/rejax_td3.py
 }
-second_python() {  # the default suite by the first of these that is there and is another than the default one
-    local python version own
+second_python() {  # the first of these that is there and is another than the default one
+    local version python own
     own=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
     for version in 3.14 3.13 3.12; do
         for python in "python$version" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version".*/bin/python; do
             if [ "$version" != "$own" ] && "$python" -c 'import ensurepip' 2>/dev/null; then
-                PYTHON=$python VENV=$root/.venv-$version bash scripts/test.sh
+                PYTHON=$python VENV=$root/.venv-$version bash scripts/test.sh tests
                 return
             fi
         done
     done
-    echo "skipped: no Python 3.12 to 3.14 beside $own on the path or under pyenv"
+    tests && echo "by Python $own alone: no Python 3.12 to 3.14 beside it on the path or under pyenv"
 }
 documentation() { NO_MKDOCS_2_WARNING=1 "$PYTHON" -m mkdocs build --strict --quiet && "$PYTHON" scripts/docs.py; }
 commit=$(git rev-parse --short HEAD)$(git diff --quiet HEAD -- . ':!benchmarks/results' || echo -dirty)
@@ -60,7 +60,6 @@ elif [ "$1" = --all ]; then
     [ -e "$result" ] ||
         printf '`scripts/test.sh --all`, %s CPUs\n\n| part | last line | minutes | commit | date |\n|---|---|---|---|---|\n' \
             "$(nproc)" >"$result"
-    part "the default suite, compiled as for users" tests
     part "the slow tests" tests --all -m slow
     part "plants and loop, double precision" in_double --all tests/plants tests/loop
     part "the others, double precision, checked for NaN" no_nan --ignore=tests/plants --ignore=tests/loop tests
@@ -68,7 +67,7 @@ elif [ "$1" = --all ]; then
     part "20 kills" "$PYTHON" scripts/soak.py
     part "golden run folders" "$PYTHON" scripts/golden_runs.py
     part "a wheel in a fresh environment" bash scripts/wheel.sh
-    part "a second Python: the default suite" second_python
+    part "the default suite, compiled as for users, by a second Python" second_python
     part "docs: built and executed" documentation
     part "stable-baselines3 learns" by_peers scripts/examples/sb3.py
     part "rejax learns" rejax
