@@ -11,13 +11,16 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
+from jaxouter import versions
+
 if sys.version_info < (3, 12):  # jaxlib 0.10 logs errors about its own compilation cache (jax issue 38445)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+versions.warn()
+
 if TYPE_CHECKING:
     from jaxouter.agents import Agent
-    from jaxouter.api import Run, learn, load, resume
-    from jaxouter.loop.environment import make
+    from jaxouter.api import Run, learn, load, make, resume
     from jaxouter.loop.policy import Policy
     from jaxouter.plants import Plant
 
@@ -29,7 +32,7 @@ _MODULES = {
     "Run": "api",
     "learn": "api",
     "load": "api",
-    "make": "loop.environment",
+    "make": "api",
     "resume": "api",
 }
 __all__ = ["Agent", "Plant", "Policy", "Run", "__version__", "learn", "load", "make", "resume"]

@@ -17,7 +17,10 @@ import tyro
 from jaxouter import cli, plants
 from jaxouter.evaluation import figures
 from jaxouter.evaluation.cache import use_compilation_cache
+from jaxouter.evaluation.policies import counter
 from jaxouter.identification import recorded_data, steady_state, validation
+from jaxouter.identification.dynamics import exploration
+from jaxouter.identification.steady_state import LEVELS
 from jaxouter.plants import Plant, interface, simulate
 from jaxouter.plants.base import in_words
 from jaxouter.plants.registry import add
@@ -60,21 +63,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if figure is not None and not figure.resolve().parent.is_dir():
             raise ValueError(f"--figure is {figure}; its folder does not exist")
         progress = stack.enter_context(showing(True))
-        progress.phase("preparing")
         plant, params = plants.make(add(options.plant, options.plant_options, cli.settings(options.set)))
         use_compilation_cache()
-        progress.phase("checking")
+        slow = counter([plant])
+        progress.phase("checking", interface.behaviour_steps(plant) if slow else 0, counter=slow)
         found = [("shapes and types", None), *interface.behaviour(plant, params)]
         rows = [[what, wrong or "implemented"] for what, wrong in found]
         cli.table(f"{plant.name}: the interface", ["what", "is"], rows)
         if plant.identified:
-            progress.phase("validating")
+            progress.phase("validating", 0)
             draw = validation_report(plant, options.plant.partition(":")[2])
         else:
-            progress.phase("responding")
+            steps = exploration(plant) + (LEVELS + 1 + 2 * len(STEPS)) * plant.episode_steps
+            progress.phase("responding", steps if slow else 0, counter=slow)
             draw = response_report(plant, params)
         if figure is not None:
-            progress.phase("drawing")
+            progress.phase("drawing", 0)
             with optional("figure"):
                 progress.print(f"figure: {draw(figure)}")
     if any(wrong for _, wrong in found):
@@ -88,7 +92,7 @@ def validation_report(plant: Plant, path: str) -> Callable[[Path], Path]:
     cli.table(f"{plant.name}: model validation", ["what", "is"], rows)
     for warning in found.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    return lambda path: figures.save(figures.log_report(found, plant.name, plant.y_unit, plant.time_unit), path)
+    return lambda path: figures.save(figures.validation_figure(found, plant.name, plant.y_unit, plant.time_unit), path)
 
 
 def response_report(plant: Plant, params: object) -> Callable[[Path], Path]:

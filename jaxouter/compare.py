@@ -16,6 +16,7 @@ from jaxouter import cli
 from jaxouter.evaluation import scenarios, statistics
 from jaxouter.evaluation.comparison import REPORT, compare
 from jaxouter.evaluation.results import Comparison
+from jaxouter.plants.base import in_words
 from jaxouter.terminal import console
 
 
@@ -80,7 +81,7 @@ def show(content: Comparison) -> None:
     """Print MAE and ratio to the limit, the best of each scenario in bold."""
     best = "[bold]{}[/bold]" if console.is_terminal else "{}*"
     columns, rows = statistics.table(content.rows, content.policies, best)
-    cli.table(f"MAE, {content.y_unit}", columns, rows)
+    cli.table("MAE" + in_words(content.y_unit, " in {}"), columns, rows)
     legend = {
         " (": "In brackets: ratio to the limit, the least MAE of policies made from the true plant.",
         "[bold]": "Bold: best without the model.",

@@ -59,7 +59,7 @@ class Options:
     scenario: tuple[str, ...] = ()
     """Scenarios, such as pitch/paper; see --list."""
     episodes: int | None = None
-    """Episodes of each scenario; default: its own number (families 64, heaters 32)."""
+    """Episodes of each scenario; default: its own number."""
     family_seed: int = scenarios.FAMILY_SEED
     """Seed of the reference families."""
     json: Path | None = None
@@ -86,9 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options = tyro.cli(Options, prog=cli.program("evaluate"), args=arguments)
         if options.list:
             return cli.print_lists()
-        run = check(options)
         progress = stack.enter_context(showing(True))
-        progress.phase("preparing")
+        run = check(options)
         use_compilation_cache()
         results, origin = evaluated(options, run, progress), Origin()
         if run is not None and options.policy is None:
@@ -172,7 +171,7 @@ def show(policy: str, results: Results, places: Mapping[str, str]) -> None:
     columns = ["scenario", *(["plant"] if places else []), *(key.replace("_", " ") for key in SHOWN)]
     cli.table(f"policy {policy}", columns, rows)
     if places:
-        print("plant: where it lies among those of the training")
+        print("plant: inside, at the edge of, or outside the range of plants trained on")
 
 
 if __name__ == "__main__":

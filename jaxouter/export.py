@@ -14,6 +14,7 @@ from jaxouter.api import Run, load
 from jaxouter.exports import files
 from jaxouter.exports.files import FORMATS
 from jaxouter.plants.base import in_words
+from jaxouter.progress import showing
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     with cli.user_errors(arguments):
         options = tyro.cli(Options, prog=cli.program("export"), args=arguments)
-        out, run = check(options)
+        with showing(True):
+            out, run = check(options)
         try:
             found = run.export(out, force=options.force)
         except ArithmeticError as error:

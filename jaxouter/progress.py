@@ -20,6 +20,7 @@ from jaxouter.terminal import console
 
 LINE_SECONDS = 5.0  # between two plain lines, at most
 FIRST = 0.1  # a first piece smaller than this share of the work is mostly compilation and does not give the pace
+FIRST_PHASE = "preparing"  # whose line comes late, as a mistake may be all there is to say
 NARROW = 30  # columns; on narrower terminals the percentage is left out
 
 
@@ -75,7 +76,7 @@ class Progress:
         self._console, self._shown, self._clock = console, shown, clock
         notebook = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
         self._live = (console.is_terminal and not console.is_dumb_terminal) or notebook
-        self._what, self._notes, self._since, self._printed = "", dict[str, str](), clock(), clock()
+        self._what, self._notes, self._since, self._printed = FIRST_PHASE, dict[str, str](), clock(), clock()
         self._work: TimeLeft | None = None
         self._counter: Callable[[], float] | None = None
         self._counted, self._before = 0.0, 0.0  # the counter, and the work done, at the last piece

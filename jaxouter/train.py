@@ -85,7 +85,8 @@ def parse(arguments: list[str]) -> Options:
     plain = [argument for argument in arguments if argument not in ("-h", "--help")]
     given = tyro.cli(Options, prog=program, args=plain, default=first)
     config = given.config
-    plant = add(config.plant, config.plant_options, cli.settings(given.set))
+    with showing(config.plant not in plants.REGISTRY):
+        plant = add(config.plant, config.plant_options, cli.settings(given.set))
     name = implied(config.preset, config.base)
     default = Options(preset(plant, name, agent), agent=agent)
     options = tyro.cli(Options, prog=program, args=arguments, default=default)
@@ -181,7 +182,7 @@ def show(summary: TrainingSummary, config: TrainConfig) -> None:
     columns += [*(["paper's DRL"] if of_paper else []), "ours", "improvement, %"]
     cli.table("MAE" + in_words(plants.make(config.plant)[0].y_unit, " in {}"), columns, rows)
     if placed:
-        print("plant: where it lies among those of the training")
+        print("plant: inside, at the edge of, or outside the range of plants trained on")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Logs of known plants, as files."""
+"""Recorded data of known plants, as files."""
 
 from __future__ import annotations
 

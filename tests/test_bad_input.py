@@ -131,7 +131,7 @@ def ended(main, arguments: list[str]) -> tuple[int, str]:
 
 @few
 @given(arguments=st.lists(words, max_size=5))
-def test_any_command_line_is_planned_or_refused(arguments, tmp_path, monkeypatch):
+def test_any_command_line_is_accepted_or_refused(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     _, text = ended(train.main, [*arguments, "--dry-run"])
     assert text.strip()

@@ -57,7 +57,7 @@ def test_what_is_not_pure_is_found_and_ends_with_status_1(tmp_path, capsys):
     assert "control steps" in capsys.readouterr().out
 
 
-def test_a_log_is_told_how_far_it_can_be_trusted(tmp_path, capsys):
+def test_models_of_recorded_data_are_validated(tmp_path, capsys):
     path = recorded.write(tmp_path / "tank-3.csv", recorded.recorded(*lag.make(), rows=800, noise=0.03))
     figure = tmp_path / "log.png"
     check.main([f"log:{path}", "--figure", str(figure)])

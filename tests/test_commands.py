@@ -79,7 +79,7 @@ def test_train_ends_with_the_table_and_the_main_figure(trained):
         assert text in done.stdout
     assert done.stdout.rstrip().endswith(str(Path("runs") / folder.name / "figures" / "paper.png"))
     begun = [line.split("  ")[0] for line in done.stdout.splitlines()]  # plain lines where there is no terminal
-    phases = ["preparing", "compiling", "learning", "evaluating", "drawing"]
+    phases = ["compiling", "learning", "evaluating", "drawing"]
     assert sorted(phases, key=begun.index) == phases
     (learned,) = (line for line in done.stdout.splitlines() if line.startswith("learned in "))
     assert re.search(r"  MAE seed 3 \S+, seed 4 \S+ \w+ on \S+/\S+  240 gradient steps$", learned)

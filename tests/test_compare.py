@@ -397,7 +397,7 @@ def test_help_names_every_option(capsys):
 
 
 @pytest.mark.slow
-def test_evaluate_takes_a_rival_that_is_tuned(tmp_path, monkeypatch, capsys):
+def test_evaluate_takes_a_baseline_that_is_tuned(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(REGISTRY, "lag", lag.make)
     maes = {}
     for name in ("static", "pi"):

@@ -77,7 +77,7 @@ def test_a_second_run_into_one_folder_is_refused(tmp_path):
         files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
         done = ended(sys.executable, "-m", "jaxouter.train", "--resume", str(run.path))
     assert done.returncode == 2
-    assert f"is being trained by process {os.getpid()}" in done.stderr
+    assert f"is in use by process {os.getpid()}" in done.stderr
     assert "Traceback" not in done.stderr
     assert files == {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
 

@@ -1,4 +1,4 @@
-"""Plants of one's own through the commands: in a file, in a log, in Gymnasium."""
+"""Plants of one's own through the commands: in a file, in recorded data, in Gymnasium."""
 
 import json
 from unittest.mock import patch

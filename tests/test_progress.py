@@ -12,14 +12,14 @@ from unittest.mock import patch
 import pytest
 from rich.console import Console
 
-from jaxouter import cli, compare, evaluate, progress, train
+from jaxouter import check, cli, compare, evaluate, export, progress, train
 from jaxouter.api import learning as learning_
 from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.evaluation.results import Comparison, PolicyInfo, Row, Summary
-from jaxouter.plants import REGISTRY, host
-from jaxouter.progress import Progress, TimeLeft
+from jaxouter.plants import REGISTRY, host, registry
+from jaxouter.progress import FIRST_PHASE, Progress, TimeLeft
 from jaxouter.training.config import preset
 from tests import lag
 from tests.load import ROOT
@@ -375,8 +375,8 @@ def test_recording_from_a_simulator_has_a_bar_of_its_own(clock, monkeypatch):
     simulators = SimpleNamespace(speed=SimpleNamespace(steps=1_000))
     monkeypatch.setattr(host, "of", lambda plant: simulators, raising=False)
     config = replace(
-        small("lag", pretraining=preset("pitch", "record").pretraining), base="static"
-    )  # 64 + 8 episodes of 50 steps
+        small("lag", pretraining=preset("pitch", "record").pretraining), base="static", explored_steps=400
+    )  # 64 + 8 episodes of 50 steps, besides those explored before
     of, learned = begun(clock, config, lag.LAG)
     learned.begins("recording", 0, 0)
     for _ in range(2):
@@ -388,6 +388,63 @@ def test_recording_from_a_simulator_has_a_bar_of_its_own(clock, monkeypatch):
     assert of.line == "compiling"
     learned.pretrained(0, Heard(750), lambda: {"mae": 2.5})
     assert of.line.startswith("learning  MAE 2.500 on lag/steps  750 of 1,800 gradient steps  49 %")
+
+
+def test_the_bar_of_the_default_preset_is_that_of_its_rounds_of_pairs(clock):
+    config = preset("pitch")
+    of, learned = begun(clock, config, lag.LAG)
+    learned.epoch(0, {"epoch": 15, "mae": 2.6, "updates": config.total_updates // 2})
+    assert of.line.startswith("learning  MAE 2.600 on lag/steps  9,000 of 18,000 gradient steps  50 %")
+
+
+def test_a_simulator_is_checked_and_identified_under_bars_that_end_full(monkeypatch, clock):
+    plant, params = host.plant(Simulated, name="mine", **DECLARED)
+    monkeypatch.setitem(REGISTRY, "mine", lambda: (plant, params))
+    bars, of_plant = [], host.of(plant)
+
+    def phase(self, what, total=None, done=0.0, counter=None):
+        bars.append((what, total, None if counter is None else counter()))
+
+    monkeypatch.setattr(Progress, "phase", phase)
+    check.main(["mine"])
+    learning_.chosen(preset("mine"), Progress(Console(file=io.StringIO()), clock=clock))
+    whats, totals, counts = zip(*bars, ("end", 0, of_plant.speed.steps), strict=True)
+    assert whats == ("checking", "responding", "identifying", "end")
+    assert [after - before for before, after in pairwise(counts)] == list(totals[:-1])
+
+
+class Simulated:
+    """A lag outside JAX."""
+
+    def reset(self, seed):
+        self.y = 0.0
+        return self.y
+
+    def step(self, r_tilde):
+        self.y += 0.5 * (r_tilde - self.y)
+        return self.y
+
+
+DECLARED = dict(y_unit="1", time_unit="s", control_step=0.1, episode_steps=40, family_steps=40)
+DECLARED |= dict(r_tilde_bounds=(-2.0, 2.0), setpoint_range=(-0.5, 0.5))
+
+
+@pytest.mark.parametrize("command", [train, evaluate, compare, check, export])
+def test_a_plant_that_is_made_slowly_is_announced_first(command, monkeypatch, tmp_path):
+    events = []
+
+    def make(*_):
+        events.append("made")
+        raise ValueError("too short")
+
+    (tmp_path / "plant.csv").touch()
+    monkeypatch.setitem(registry.KINDS, "log", make)
+    monkeypatch.setattr(Progress, "__enter__", lambda self: events.append(self.line))
+    reference, run = f"log:{tmp_path}/plant.csv", str(next(iter((ROOT / "tests" / "runs").glob("pitch-*"))))
+    named = {evaluate: [run, "--plant", reference], export: [run, "--format", "npz", "--plant", reference]}
+    with pytest.raises(SystemExit):
+        command.main(named.get(command, [reference]))
+    assert events == [FIRST_PHASE, "made"]
 
 
 def test_ctrl_c_after_the_learning_says_how_to_go_on(monkeypatch, tmp_path, capsys):

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from jaxouter import cli, terminal
 from jaxouter.evaluation import cache, drawing
+from tests import interrupts
 from tests.load import ROOT
 
 MODULES = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -26,8 +27,14 @@ HOMELESS = """
 import os, pwd, runpy, sys
 def nobody(uid): raise KeyError(uid)
 pwd.getpwuid = nobody  # as for a number of which the system knows no user
-sys.argv[1:] = ["warm.py:Warm", "--figure", "step-response.png"]
-runpy.run_module("jaxouter.check", run_name="__main__", alter_sys=True)
+for command, *arguments in (
+    ("check", "warm.py:Warm", "--figure", "step-response.png"),
+    ("train", "warm.py:Warm", "--dry-run"),
+    ("evaluate", "--plant", "warm.py:Warm", "--policy", "none", "--scenario", "Warm/steps", "--episodes", "1"),
+    ("compare", "--list"),
+):
+    sys.argv[1:] = arguments
+    runpy.run_module(f"jaxouter.{command}", run_name="__main__", alter_sys=True)
 """
 
 
@@ -46,8 +53,10 @@ def test_a_command_works_without_home_user_cache_backend_terminal_and_unicode(tm
     fast = {name: os.environ[name] for name in ("MPLCONFIGDIR", "JAX_COMPILATION_CACHE_DIR")}
     done = ended(HOMELESS, tmp_path, env=bare | fast)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert "-2 to 2 ?C" in done.stdout
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: there is no cache folder, for want of a home")
+    for text in ("-2 to 2 ?C", "gradient steps", "policy none", "pitch/paper"):
+        assert text in done.stdout
     assert (tmp_path / "step-response.png").stat().st_size > 10_000
     assert {path.name for path in tmp_path.iterdir()} == {"warm.py", "step-response.png"}
 
@@ -63,13 +72,14 @@ print("imported", flush=True)
 
 import jax
 from jax.extend.backend import clear_backends
-from jaxouter import check, compare, evaluate, live, train
+from jaxouter import check, compare, evaluate, export, live, train
 for name, main, *arguments in (
     ("cuda", train.main, "lag.py:make", "--seeds", "2"),
     ("nonsense", train.main, "heaters", "--dry-run"),
     ("tpu", evaluate.main, "--policy", "none"),
     ("cuda", compare.main, "lag.py:make"),
     ("cpu,nonsense", check.main, "lag.py:make"),
+    ("cuda", export.main, "run", "--format", "npz"),
     ("tpu", live.main, "loop.py:step", "--learn", "--r-tilde-bounds", "0", "1", "--setpoint-range", "0", "1", "--dt",
      "0.1", "--run", "loop"),
 ):
@@ -128,12 +138,32 @@ def test_every_module_is_imported_without_what_posix_alone_has(elsewhere):
 def test_a_device_that_is_not_there_is_said_before_anything_else(elsewhere):
     done, folder = elsewhere
     assert done.returncode == 0, done.stderr
-    names = ("cuda", "nonsense", "tpu", "cuda", "cpu,nonsense", "tpu")
+    names = ("cuda", "nonsense", "tpu", "cuda", "cpu,nonsense", "cuda", "tpu")
     text = "error: JAX_PLATFORMS is '{}', but JAX finds only cpu: unset it, or set JAX_PLATFORMS=cpu"
     assert [line for line in done.stderr.splitlines() if "error" in line] == [text.format(name) for name in names]
     assert "Traceback" not in done.stderr
     assert done.stdout == "imported\n"
     assert {path.name for path in folder.iterdir()} == {"lag.py", "loop.py"}
+
+
+def test_a_device_that_the_environment_names_and_is_not_there_is_one_line(tmp_path):
+    code = "from jaxouter import train; train.main(['heaters', '--dry-run'])"
+    done = ended(code, tmp_path, env={"JAX_PLATFORMS": "nonsense"})
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: JAX_PLATFORMS is 'nonsense'")
+
+
+def test_a_suite_that_is_deaf_to_ctrl_c_starts_what_hears_it():
+    deaf = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as nohup does
+    try:
+        with interrupts.heard():
+            code = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+            done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, deaf)
+    assert done.stdout == "True\n"
 
 
 NOTEBOOK = """

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from jaxouter.api.run import Run, load
-from jaxouter.evaluation import pace, scenarios
+from jaxouter.evaluation import pace, scenarios, verdict
 from jaxouter.evaluation.baselines import SIMPLE
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import mae, number, reward_terms, trained_return
@@ -32,7 +32,7 @@ from jaxouter.evaluation.policies import (
     result,
 )
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.evaluation.verdict import judge
+from jaxouter.identification.dynamics import exploration
 from jaxouter.loop import rewards
 from jaxouter.loop.policy import Linear
 from jaxouter.plants import Plant, base, make, slug
@@ -177,7 +177,6 @@ def training(
     devices.connect(config.devices, processes.check(config.devices))
     shown = progress if isinstance(progress, Progress) else progress and devices.is_first()
     with showing(shown) as progress, ExitStack() as stack:
-        progress.phase("preparing")
         config = config if resumes is not None else chosen(config, progress)
         resources(config).check()
         Fleet.of(config)  # the last checks before anything is written
@@ -207,6 +206,9 @@ def training(
 
 def chosen(config: TrainConfig, progress: Progress) -> TrainConfig:
     """Choose the plant-dependent settings of the configuration, and say which."""
+    plant, _ = make(config.plant)
+    if (slow := counter([plant])) is not None:
+        progress.phase("identifying", exploration(plant), counter=slow)
 
     def choice() -> str:
         found = choose(config)
@@ -221,8 +223,8 @@ def chosen(config: TrainConfig, progress: Progress) -> TrainConfig:
 
 def go_on(run: RunFolder) -> str:
     """How to resume the run."""
-    source = REGISTRATIONS.get(base(run.config.plant))
-    if source is not None and source.session:
+    registered = REGISTRATIONS.get(base(run.config.plant))
+    if registered is not None and registered.session:
         return f"resume with: jaxouter.resume(jaxouter.load({str(run.path)!r}, plant=...))"
     return f"resume with: python -m jaxouter.train --resume {run.path}"
 
@@ -298,7 +300,8 @@ class Learning:
         if what != self._what:
             slow = counter([self._plant])
             if slow is not None and what == "recording":
-                self._progress.phase(what, self._config.identification_steps, counter=slow)
+                steps = self._config.identification_steps - self._config.explored_steps  # those came before
+                self._progress.phase(what, steps, counter=slow)
             elif slow is not None and self._what == "recording":
                 self._progress.phase(what, self._work, self._worked())
             else:
@@ -367,7 +370,8 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
             text = pace.told(identifiers, episodes, rollouts)
             progress.print(f"evaluation: {text}, as long as learning took at most; --episodes sets another number")
     selected = [scenarios.get(identifier, episodes) for identifier in identifiers]
-    total = rollouts * sum(scenario.r.size for scenario in selected)
+    judged = verdict.steps(trainer.env.plant)
+    total = rollouts * (sum(scenario.r.size for scenario in selected) + judged)
     progress.phase("evaluating", total, counter=counter([selected[0].plant]))
     policies = {seed: NamedPolicy("learned", trainer.policy, params, plant) for seed, params in of_seeds.items()}
 
@@ -396,7 +400,7 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
         reward=TrainedReward(vars(config.reward), terms, vars(rewards.PAPER) | {"terms": 0.0}),
         places={scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected},
         episodes={scenario.id: len(scenario.r) for scenario in selected},
-        verdict=judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine),
+        verdict=verdict.judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine),
         results=[
             result("learned", results, seed=seed, trained_return=trained(results)) for seed, results in learned.items()
         ]

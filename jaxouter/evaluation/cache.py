@@ -25,7 +25,7 @@ from jaxouter import terminal
 from jaxouter.plants import registry
 
 PACKAGE = Path(jaxouter.__file__).parent
-FOLDERS = ("plants", "loop", "identification", "agents", "training", "evaluation/baselines")
+FOLDERS = ("plants", "loop", "identification", "agents", "tasks", "training", "evaluation/baselines")
 FILES = ("metrics.py", "rollout.py", "scenarios.py", "sweeps.py", "stability.py", "jobs.py", "cache.py")
 
 

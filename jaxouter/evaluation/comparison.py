@@ -82,22 +82,21 @@ def compare(
         ValueError: something named does not exist, does not fit together, or failed.
     """
     begun = time.perf_counter()
-    with own_errors():
+    with own_errors(), showing(progress) as progress:
         selection = select(plant, runs, policies, scenario, sweep, set, agents, family_seed, out)
         cache.use_compilation_cache()
         try:
             selection.out.mkdir(parents=True)
         except OSError as error:
             raise ValueError(f"the folder {selection.out} can't be made: {error.strerror}") from None
-        with showing(progress) as progress:
-            try:
-                done = work(selection, progress)
-            except BaseException:
-                selection.out.rmdir()  # still empty, and its name is wanted again
-                raise
-            progress.phase("statistics", 0)
-            content = assemble(selection, done, command, begun)
-            write(selection, content, done, progress)
+        try:
+            done = work(selection, progress)
+        except BaseException:
+            selection.out.rmdir()  # still empty, and its name is wanted again
+            raise
+        progress.phase("statistics", 0)
+        content = assemble(selection, done, command, begun)
+        write(selection, content, done, progress)
     return content
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from jaxouter.evaluation.drawing import Axes, Figure, Line2D, LogNorm, SubFigure
 from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, styled, symbol, times
@@ -192,7 +193,7 @@ def _mean_over(line: Line, names: Sequence[str], key: str) -> float | None:
     values = [line.median(name, key) for name in names]
     if any(value is None for value in values):
         return None
-    return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), 1e-9)))))
+    return float(scipy.stats.gmean(np.array(values, float)))
 
 
 def _panels(comparison: Comparison) -> dict[str, list[str]]:

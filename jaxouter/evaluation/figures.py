@@ -98,14 +98,14 @@ def _modified(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     axes.set_xlim(t[0], t[-1])
 
 
-def _houses(axes: Axes, scenario: Scenario, traces: Traces) -> None:
+def _members(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """The spread of the single outputs of the first episode."""
     if traces.members is None:
         return
     t = times(scenario, traces.r.shape[1])[1:]
     quantiles = np.quantile(traces.members[0], [0.0, 0.05, 0.95, 1.0], axis=1)
-    axes.fill_between(t, quantiles[0], quantiles[3], color=LEARNED, alpha=0.12, lw=0, label="all houses")
-    axes.fill_between(t, quantiles[1], quantiles[2], color=LEARNED, alpha=0.25, lw=0, label="90 % of the houses")
+    axes.fill_between(t, quantiles[0], quantiles[3], color=LEARNED, alpha=0.12, lw=0, label="all members")
+    axes.fill_between(t, quantiles[1], quantiles[2], color=LEARNED, alpha=0.25, lw=0, label="90 % of the members")
 
 
 def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
@@ -113,16 +113,14 @@ def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     t, unit = times(scenario, traces.r.shape[1])[1:], symbol(scenario.plant.y_unit)
     if traces.members is not None:
         change = np.abs(np.diff(traces.members[0], axis=0))
-        axes.fill_between(t[1:], 0, change.max(1), color=LEARNED, alpha=0.12, lw=0, label="largest of all houses")
+        axes.fill_between(t[1:], 0, change.max(1), color=LEARNED, alpha=0.12, lw=0, label="largest of all members")
         axes.fill_between(
-            t[1:], 0, np.quantile(change, 0.95, axis=1), color=LEARNED, alpha=0.25, lw=0, label="95 % of the houses"
+            t[1:], 0, np.quantile(change, 0.95, axis=1), color=LEARNED, alpha=0.25, lw=0, label="95 % of the members"
         )
     axes.plot(t, np.abs(np.diff(traces.y[0], prepend=traces.y0[0])), color=LEARNED, lw=1.6, label="mean y")
     limit = scenario.plant.rate_limit
     if limit is not None:
-        axes.axhline(
-            limit, color=LIMIT, ls=":", lw=1.2, label=f"comfort limit {limit:g} {unit}/{scenario.plant.time_unit}"
-        )
+        axes.axhline(limit, color=LIMIT, ls=":", lw=1.2, label=f"limit {limit:g} {unit}/{scenario.plant.time_unit}")
     axes.set_ylabel(f"|Δy| [{unit}/{scenario.plant.time_unit}]")
     axes.set_xlim(0, t[-1])
 
@@ -142,7 +140,7 @@ def response(scenario: Scenario, inner: Traces, learned: Traces) -> Figure:
     grid = figure.subplots(3 if rates else 2, 2, sharex=True, sharey="row", squeeze=False)
     unit = symbol(scenario.plant.y_unit)
     for column, (name, traces) in enumerate((("inner loop alone", inner), ("learned outer loop", learned))):
-        _houses(grid[0, column], scenario, traces)
+        _members(grid[0, column], scenario, traces)
         _output(grid[0, column], scenario, traces, INNER if column == 0 else LEARNED, "output y")
         _finish(grid[0, column], scenario, f"{name}: MAE {mae(traces):.3g} {unit}", last=False)
         _modified(grid[1, column], scenario, traces)
@@ -179,10 +177,10 @@ def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: M
         if heaters and letter == "d":
             _changes(axes, scenario, traces)
             axes.set_ylim(bottom=0)
-            title = f"({letter}) {short}, {name}: change an hour"
+            title = f"({letter}) {short}, {name}: change per {scenario.plant.time_unit}"
         else:
             if name == "learned outer loop":
-                _houses(axes, scenario, traces)
+                _members(axes, scenario, traces)
             _output(axes, scenario, traces, INNER if name == "inner loop alone" else LEARNED, "output y")
             if name == "learned outer loop":
                 axes.step(
@@ -274,13 +272,13 @@ def live(steps: Mapping[str, np.ndarray], unit: str = "1") -> Figure:
     return styled(figure)
 
 
-def log_report(report: Validation, title: str, y_unit: str = "1", time_unit: str = "s") -> Figure:
-    """What a log tells: the held-out free run, the step responses, and the levels and frequencies of its r~.
+def validation_figure(report: Validation, title: str, y_unit: str = "1", time_unit: str = "s") -> Figure:
+    """Model validation: the held-out free run, the step responses, levels and frequencies of the recorded r~.
 
     Args:
-        report: of the log.
-        title: of the whole, such as the name of the log.
-        y_unit, time_unit: of the log.
+        report: of the recorded data.
+        title: of the whole, such as the name of their file.
+        y_unit, time_unit: of the recorded data.
     """
     figure = Figure(figsize=(10, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, 3)

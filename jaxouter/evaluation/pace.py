@@ -9,7 +9,7 @@ from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.scenarios import FAMILY_MEMBERS
 from jaxouter.plants import Plant, host, make
 
-SAID = 10.0  # s, from which on it is said how long an evaluation takes
+SAID = 10.0  # s, of an evaluation; how long it takes is printed from there on
 
 
 def seconds(identifiers: Iterable[str], episodes: int | None, rollouts: int = 1) -> float:
@@ -31,7 +31,7 @@ def seconds(identifiers: Iterable[str], episodes: int | None, rollouts: int = 1)
 def affordable(identifiers: Iterable[str], rollouts: int, time: float) -> int | None:
     """Episodes of each scenario, at most a family's own number, that take no longer than `time` (s); at least one.
 
-    Rounded down to a power of two, lest another speed of the machine give another number. None: the plant is JAX, and
+    Rounded down to a power of two, so that machines of similar speed get the same number. None: the plant is JAX, and
     its scenarios have their own numbers.
     """
     names = list(identifiers)

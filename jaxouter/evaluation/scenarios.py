@@ -29,7 +29,7 @@ ROUNDING = 1e-5  # of a number of the plant, by which it may lie outside its ran
 
 @dataclass(frozen=True)
 class Scenario:
-    """Episodes that every policy meets alike."""
+    """The same episodes for every policy."""
 
     id: str
     plant: Plant

@@ -1,7 +1,7 @@
 """Local stability of the whole closed loop: plant with its delay lines, and whatever the policy remembers.
 
 At a held set-point the loop is a map z -> F(z) from one control step to the next. Its equilibrium is found by a
-semi-smooth Newton method, and the spectral radius of its Jacobian there certifies: below 1 the loop returns to the
+semi-smooth Newton method, and the spectral radius of its Jacobian there decides: below 1 the loop returns to the
 equilibrium after every small upset, above 1 it does not. Noise of plant and sensor is off; all is in double precision.
 """
 

@@ -31,6 +31,11 @@ class Verdict(Struct, frozen=True):
     text: str  # for people
 
 
+def steps(plant: Plant) -> int:
+    """Control steps for which `judge` runs each policy."""
+    return (EPISODES if plant.differentiable else ON_HOST) * plant.episode_steps
+
+
 def judge(
     plant: Plant,
     params: Any,
@@ -47,7 +52,7 @@ def judge(
         policy: of all seeds.
         learned, simple: what is compared.
     """
-    count = EPISODES if plant.differentiable else ON_HOST
+    count = steps(plant) // plant.episode_steps
     idle = jax.tree.map(
         jnp.zeros_like, next(iter(learned.values())).actor
     )  # its action is zero: what is left is affine

@@ -3,7 +3,7 @@
     act = jax.export.deserialize(bytearray(path.read_bytes())).call
     r_tilde, y_past, r_tilde_past, integral = act(r, y, y_past, r_tilde_past, integral)
 
-All are float32. Before the first step y_past (M,) is filled with the first y, r_tilde_past (H,) with that y clipped to
+All are float32. Before the first step y_past (M,) is filled with the first y, r_tilde_past (M,) with that y clipped to
 the bounds of r~, and integral is 0.
 """
 

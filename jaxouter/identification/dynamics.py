@@ -55,13 +55,18 @@ def of_record(data: Record) -> Dynamics:
     return Dynamics(n, dead, settling(model) if kind == "stable" else math.inf, kind, shown)
 
 
+def exploration(plant: Plant) -> int:
+    """Control steps that `explore` records."""
+    return (1 if plant.draw is None else DRAWN) * EXPLORED * plant.episode_steps
+
+
 def explore(plant: Plant, params: Any, key: chex.PRNGKey) -> tuple[list[Dynamics], int]:
     """Dynamics of the plant (of `DRAWN` plants if episodes draw them), and the control steps that were recorded."""
     found = []
     for one in jax.random.split(key, 1 if plant.draw is None else DRAWN):
         drawn = params if plant.draw is None else plant.draw(jax.random.fold_in(one, 1), params)
         found.append(of_record(within(record(plant, drawn, one, EXPLORED), plant.divergence_bounds)))
-    return found, len(found) * EXPLORED * plant.episode_steps
+    return found, exploration(plant)
 
 
 def history_for(order: int, dead: int, least: int) -> int:

@@ -143,6 +143,11 @@ def step_response(model: Model, steps: int) -> np.ndarray:
     return np.asarray(scipy.signal.lfilter(np.append(0.0, model.b), np.append(1.0, -model.a), np.ones(steps)))
 
 
+def impulse_response(model: Model, steps: int) -> np.ndarray:
+    """Change of y_1 to y_steps after an r~ larger by 1 in control step 0 alone; (steps,)."""
+    return np.asarray(scipy.signal.lfilter(model.b, np.append(1.0, -model.a), np.eye(1, steps)[0]))
+
+
 def settling(model: Model) -> int:
     """Control steps until the step response stays within 5 % of its final value."""
     tail = math.log(1e-3) / math.log(max(radius(model), 1e-3))

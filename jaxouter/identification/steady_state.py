@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxouter.loop.policy import Linear, LinearLaw, affine, none
 from jaxouter.plants import Plant, host, simulate
-from jaxouter.plants.base import RUN_ONCE
+from jaxouter.plants.base import RUN_ONCE, in_words
 
 LEVELS = 8
 DRIFT = 0.08  # share of the gain by which it may change in a fifth of an episode if y has settled
@@ -196,11 +196,11 @@ def unanswered(
                 "make episodes several times as long as the dead time (episode_steps)"
             )
         return f"no r~ in {plant.r_tilde_bounds} moves its output: {same} for {len(longer)} control steps"
-    most = float(moved.max())
+    most, unit = float(moved.max()), in_words(plant.y_unit)
     if most < TINY * setpoints:
         return (
-            f"r~ from {low:g} to {high:g} {plant.y_unit} moves y by only {most:.3g} {plant.y_unit}, but the set-points "
-            f"span {setpoints:.3g} {plant.y_unit}: the gain is too small to hold them"
+            f"r~ from {low:g} to {high:g}{unit} moves y by only {most:.3g}{unit}, but the set-points span "
+            f"{setpoints:.3g}{unit}: the gain is too small to hold them"
         )
     if abs(gain) * (high - low) > TINY * setpoints:
         return None  # significant in spite of the noise

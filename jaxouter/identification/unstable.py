@@ -23,7 +23,7 @@ import scipy
 from jaxouter.identification import lq
 from jaxouter.identification.counterfactual import CounterfactualParams
 from jaxouter.identification.dynamics import NEGLIGIBLE
-from jaxouter.identification.linear_models import fit_arx, prediction_error
+from jaxouter.identification.linear_models import fit_arx, impulse_response, prediction_error, radius
 from jaxouter.identification.records import Record, record, within
 from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.loop import closed_loop, rewards
@@ -31,7 +31,8 @@ from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.policy import Linear, LinearLaw, Past
 from jaxouter.loop.references import redrawn, telegraph
 from jaxouter.plants import Plant
-from jaxouter.plants.base import RUN_ONCE
+from jaxouter.plants.arx import Model
+from jaxouter.plants.base import RUN_ONCE, in_words
 
 EPISODES = 64  # under random r~, of which the lags are chosen
 LAGS = (0.15, 0.2, 0.3, 0.4)  # shares of an episode
@@ -49,23 +50,6 @@ class Identified(NamedTuple):
 
     law: LinearLaw
     params: CounterfactualParams  # of the model, on which each episode replays a recorded start
-
-
-class Model(NamedTuple):
-    """y_(k+1) = sum_i a_i y_(k-i) + b_i r~_(k-i) + level, i from 0."""
-
-    a: np.ndarray  # (n,)
-    b: np.ndarray  # (n,)
-    level: float
-
-    @property
-    def growth(self) -> float:
-        """Factor by which a deviation grows in a control step."""
-        return float(np.abs(np.roots(np.append(1.0, -self.a))).max())
-
-    def response(self, steps: int) -> np.ndarray:
-        """Of y to a unit of r~ in the control step before the first; (steps,)."""
-        return np.asarray(scipy.signal.lfilter(self.b, np.append(1.0, -self.a), np.eye(1, steps)[0]))
 
 
 def lags(plant: Plant, params: Any, key: chex.PRNGKey) -> int:
@@ -129,11 +113,11 @@ def _law(
     """The LQ law that suits the records best, and the episodes on their model that can be brought back."""
     model = fit(plant, data, history)
     replayed = continued(plant, data, model)
-    alive = can_be_brought_back(plant, replayed, model.response(plant.episode_steps))
+    alive = can_be_brought_back(plant, replayed, impulse_response(model, plant.episode_steps))
     dead = int(np.argmax(np.abs(model.b) > NEGLIGIBLE * np.abs(model.b).max()))
     about = (
-        f"{plant.name} is unstable alone: a deviation grows by {model.growth:.3g} in a control step, r~ acts after "
-        f"{dead + 1} and lies in {plant.r_tilde_bounds} {plant.y_unit}"
+        f"{plant.name} is unstable alone: a deviation grows by {radius(model):.3g} in a control step, r~ acts after "
+        f"{dead + 1} and lies in {plant.r_tilde_bounds}{in_words(plant.y_unit)}"
     )
     if not alive.any():
         raise ValueError(f"{about}; that brings back none of the {len(data.y)} recorded starts")
@@ -151,8 +135,8 @@ def fit(plant: Plant, data: Record, n: int) -> Model:
     ((a, b),) = lq.fits(data, n, [NOISE * float(np.ptp(plant.setpoint_range)) / 2], levels=False)
     k = np.arange(n - 1, data.r_tilde.shape[1])
     past = k[:, None] - np.arange(n)
-    level = np.nanmean(data.y[:, k + 1] - data.y[:, past] @ a - data.r_tilde[:, past] @ b)
-    return Model(a, b, float(level))
+    residual = data.y[:, k + 1] - data.y[:, past] @ a - data.r_tilde[:, past] @ b
+    return Model(a, b, np.nanmean(residual), np.nanstd(residual))
 
 
 def continued(plant: Plant, data: Record, model: Model) -> Record:
@@ -178,7 +162,7 @@ def continued(plant: Plant, data: Record, model: Model) -> Record:
         dy, dr_tilde = _pushed(dy, now - y[:, k]), _pushed(dr_tilde, r_tilde_new[:, k] - r_tilde[:, k])
         y_past, r_tilde_past = _pushed(y_past, now), _pushed(r_tilde_past, r_tilde_new[:, k])
         of_record = y[:, k + 1] + dy @ model.a + dr_tilde @ model.b
-        of_model = model.level + y_past @ model.a + r_tilde_past @ model.b
+        of_model = model.c + y_past @ model.a + r_tilde_past @ model.b
         y_new[:, k + 1] = np.where(k < last, of_record, of_model)
     return Record(r_tilde_new, y_new)
 

@@ -14,7 +14,7 @@ import chex
 import jax
 import numpy as np
 
-from jaxouter.plants import declaration, heaters, pitch, versions
+from jaxouter.plants import declaration, heaters, pitch
 from jaxouter.plants.base import Plant, outputs
 from jaxouter.plants.errors import Raised, said
 
@@ -23,7 +23,6 @@ __all__ = ["REGISTRY", "Plant", "Ranges", "make", "randomised", "resolve", "simu
 Ranges = tuple[tuple[str, float, float], ...]
 """(name, low, high) of each parameter that is drawn."""
 
-versions.warn()
 SHORT = 4  # longest vector whose elements have names
 REGISTRY: dict[str, Callable[..., tuple[Plant, Any]]] = {"pitch": pitch.make, "heaters": heaters.make}
 

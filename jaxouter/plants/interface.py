@@ -86,6 +86,11 @@ def _of(value: Any) -> str:
     return ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves if hasattr(leaf, "dtype")) or shown(value)
 
 
+def behaviour_steps(plant: Plant) -> int:
+    """Control steps for which `behaviour` runs the plant."""
+    return 2 * plant.episode_steps + (1 + 2 * LANES) * STEPS
+
+
 def behaviour(plant: Plant, params: Any) -> Iterator[tuple[str, str | None]]:
     """Run the plant, and check that it behaves as a pure function of its arguments.
 

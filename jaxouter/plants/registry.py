@@ -135,14 +135,14 @@ def _add(reference: str, options: PlantOptions) -> str:
             _plain(reference, options)
         return reference
     name, make, path = _find(reference, options)
-    source = Registration(reference, options, hashlib.sha256(path.read_bytes()).hexdigest())
-    if REGISTRATIONS.get(name, source) != source or (name in plants.REGISTRY and name not in REGISTRATIONS):
+    registered = Registration(reference, options, hashlib.sha256(path.read_bytes()).hexdigest())
+    if REGISTRATIONS.get(name, registered) != registered or (name in plants.REGISTRY and name not in REGISTRATIONS):
         other = REGISTRATIONS[name].reference if name in REGISTRATIONS else "a built-in plant"
         raise ValueError(f"{reference} has the short name {name!r}, which is that of {other}; rename it")
     if name not in REGISTRATIONS:
         _check(reference, make)
         plants.REGISTRY[name] = make
-        REGISTRATIONS[name] = source
+        REGISTRATIONS[name] = registered
     return name
 
 

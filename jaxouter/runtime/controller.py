@@ -128,7 +128,7 @@ class Transfer:
 
 
 class Controller:
-    """The spec in a control loop: call `step(r, y)` once per control step, and apply the r~ it returns until the next.
+    """Runs a spec in a control loop: call `step(r, y)` once per control step, and hold its r~ until the next call.
 
         controller = Controller.load("controller.npz", engaged=False)
         r_tilde = controller.step(r, y)

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxouter.identification  # noqa: F401 - for plants log:FILE
 from jaxouter.loop.environment import Environment, EnvParams, EnvState, make
 from jaxouter.runtime import registration
 
@@ -75,7 +76,7 @@ def _steps(env: Environment, params: EnvParams, carry: Any, actions: np.ndarray)
 
 
 def _made(plant: str, render_mode: str | None, settings: dict[str, Any]) -> tuple[Environment, EnvParams]:
-    if render_mode is not None:  # stable-baselines3 asks for one, and only on this error goes on without it
+    if render_mode is not None:  # stable-baselines3 gives one, and tries again without it after a TypeError only
         raise TypeError(f"render_mode is {render_mode!r}; there is nothing to render, so it must be None")
     return make(plant, **settings)
 

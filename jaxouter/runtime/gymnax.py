@@ -16,6 +16,7 @@ import chex
 import jax
 from flax import struct
 
+import jaxouter.identification  # noqa: F401 - for plants log:FILE
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvState
 from jaxouter.loop.spaces import Box

@@ -366,7 +366,8 @@ def judged(kept: jax.Array, incumbent: jax.Array, candidate: jax.Array, changed:
         changed: share of the steps of each in which r changed.
     """
     found = gate.judge(jnp.stack([kept, candidate]) - incumbent[None], gate.kind(changed))
-    return jnp.where(found.better | np.array([True, False]), found.gain / jnp.maximum(found.error, 1e-12), 0.0)
+    tiny = jnp.finfo(found.error.dtype).tiny
+    return jnp.where(found.better | np.array([True, False]), found.gain / jnp.maximum(found.error, tiny), 0.0)
 
 
 def run(

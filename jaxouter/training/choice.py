@@ -21,7 +21,7 @@ ON_HOST = 4  # episodes on which actors are compared, on a plant that is simulat
 
 
 UNSTABLE = {
-    "correction": 1.0,  # of a law that is kept from the bounds of r~ rather than good
+    "correction": 1.0,  # the law is tuned to stay off the bounds of r~, so the actor gets the whole range
     "disturbances.noise": 0.006,
     "disturbances.load": 0.0,
     "pretraining.closed_loop": 128,
@@ -42,7 +42,7 @@ class Choice(NamedTuple):
 def choose(config: TrainConfig) -> Choice:
     """Choose history, lags and the length of recorded episodes by the plant's dead time and order.
 
-    These are identified under random r~. Settings that are given stay, and so do all of the built-in plants.
+    These are identified under random r~. Settings that are given stay; the built-in plants are not identified.
 
     Raises:
         ValueError: no r~ moves the output.
@@ -76,7 +76,7 @@ def choose(config: TrainConfig) -> Choice:
 def _unstable(config: TrainConfig, plant: Plant, params: Any, key: chex.PRNGKey, steps: int) -> Choice:
     """The choice for a plant that diverges under random r~: it is held by the LQ law first, and then learned on."""
     if config.base != "lq":
-        text = f"{plant.name} is unstable alone, which only training with --base lq can hold"
+        text = f"{plant.name} is unstable alone; train with --base lq, which holds it"
         return Choice(replace(config, explored_steps=steps), None, (text,))
     defaults = to_dict(preset(config.plant, config.preset, agents.name_of(config.agent)))
     given = to_dict(config)
@@ -121,7 +121,7 @@ def fitted(config: TrainConfig, plant: Plant, found: list[Dynamics], steps: int)
         whose = "--history" if config.history is not None else f"what {plant.name} declares"
         warnings.append(
             f"the dead time of {dead} control steps does not fit in the {history} past samples of the observation "
-            f"({whose}), so the observation misses r~ that y has yet to follow; set --history {wanted}"
+            f"({whose}), so the observation lacks the r~ to which y has not yet responded; set --history {wanted}"
         )
     start, warned = _pretraining(config, plant, history if history > dead else wanted, dead)
     if 2 * dead > plant.episode_steps:

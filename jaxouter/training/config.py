@@ -67,7 +67,7 @@ class TrainConfig:
     plant: Annotated[str, tyro.conf.Positional]
     """Plant to learn on: pitch, heaters, FILE.py:NAME (your own), gym:ID, fmu:FILE or log:FILE."""
     preset: str
-    """Preset that supplies the defaults: default (the LQ law of a record, bettered by reinforcement learning), scratch
+    """Preset that supplies the defaults: default (the LQ law of a record, improved by reinforcement learning), scratch
     (reinforcement learning alone, as with --base static), record (pretraining alone), paper; for pitch and heaters also
     robust."""
     agent: AgentConfig
@@ -104,12 +104,12 @@ class TrainConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward that is trained on."""
     disturbances: Disturbances = field(default_factory=Disturbances)
-    """Noise and loads that half of the training episodes have, whoever learns from them."""
+    """Noise and loads, each in half of the training episodes."""
     pairs: PairsConfig = field(default_factory=PairsConfig)
     """Rounds of learning from pairs, after the agent's own steps; only a better actor is kept."""
     compared: int = 512
-    """Fresh training episodes on which an actor of a round of pairs must be better than the one before, and in the end
-    what was learned better than the base law alone, which else remains; 0: no check in the end."""
+    """Fresh training episodes of the gate: after a round of pairs the new actor is kept if it is better on them than
+    the old one, and at the end the policy if it is better than the base law alone. 0: no check at the end."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
     """Control steps spent to identify the dead time, for settings that were not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)

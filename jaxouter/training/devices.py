@@ -27,7 +27,7 @@ from jaxouter.training.environments import AXIS, TrainState
 from jaxouter.training.trainer import Trainer, build
 
 SEEDS = "seeds"
-HOUSES = "houses"
+MEMBERS = "members"
 # On CPUs use Eigen for matrix products instead of YNNPACK, the default of jax 0.10: 5 % faster, and 10 % if devices
 # share cores.
 EIGEN = {"xla_cpu_experimental_ynn_fusion_type": ""}
@@ -316,7 +316,7 @@ def spread(tree: Tree, members: int, devices: int) -> Tree:
 
     Args:
         tree: pytree; arrays of shape (members,) are split, all others are on every device.
-        members: houses.
+        members: how many.
         devices: must divide `members`.
 
     Raises:
@@ -326,9 +326,9 @@ def spread(tree: Tree, members: int, devices: int) -> Tree:
         raise ValueError(
             f"devices is {devices}; it must divide the {members} members and be at most {jax.device_count()}"
         )
-    over = Mesh(np.array(jax.devices()[:devices]), (HOUSES,))
+    over = Mesh(np.array(jax.devices()[:devices]), (MEMBERS,))
 
     def place(leaf: chex.Array) -> jax.Array:
-        return jax.device_put(leaf, NamedSharding(over, P(HOUSES) if leaf.shape == (members,) else P()))
+        return jax.device_put(leaf, NamedSharding(over, P(MEMBERS) if leaf.shape == (members,) else P()))
 
     return jax.tree.map(place, tree)

@@ -1,8 +1,8 @@
 """The gate: a new actor is kept only if it is better on fresh training episodes than the one before.
 
-Both meet the same episodes: starts, set-points, noise, loads and the plant's own randomness. The mean gain must be
-positive, and no stratum (set-points that stay, jump or move, with or without noise and load) may lose more than the
-noise of its estimate: a gate on the mean alone would let a stratum decay.
+Both are evaluated on the same episodes: starts, set-points, noise, loads and the plant's own randomness. The mean gain
+must be positive, and no stratum (set-points that stay, jump or move, with or without noise and load) may lose more than
+the noise of its estimate: a gate on the mean alone would let a stratum decay.
 """
 
 from __future__ import annotations
@@ -97,5 +97,5 @@ def judge(gains: jax.Array, strata: jax.Array) -> Comparison:
     mean = gains @ member / jnp.maximum(count, 1.0)  # (C, strata)
     variance = gains**2 @ member / jnp.maximum(count, 1.0) - mean**2
     error = jnp.sqrt(jnp.maximum(variance, 0.0) / jnp.maximum(count - 1.0, 1.0))
-    worst = jnp.min(jnp.where(count > 1, mean / jnp.maximum(error, 1e-12), jnp.inf), 1)
+    worst = jnp.min(jnp.where(count > 1, mean / jnp.maximum(error, jnp.finfo(error.dtype).tiny), jnp.inf), 1)
     return Comparison(jnp.mean(gains, 1), jnp.std(gains, 1) / episodes**0.5, worst)

@@ -93,29 +93,9 @@ class Improvement:
         size = config.change * jax.random.uniform(key_size, (config.states,), float, 0.2, 1.0)
         change = jnp.where(alive, size * jax.random.rademacher(key_sign, (config.states,), float), 0.0)
         keys = jax.random.split(key_pairs, config.states)
-        return jax.vmap(lambda *given: self._pair(actor, base, params, *given))(states, change, keys)
+        return jax.vmap(lambda *given: self.pair(actor, base, params, *given))(states, change, keys)
 
-    def _visit(
-        self, actor: Any, base: LinearLaw, params: EnvParams, sigma: jax.Array, key: chex.PRNGKey
-    ) -> tuple[EnvState, jax.Array]:
-        """The states of an episode with exploration, and whether y had not diverged before; (T, ...)."""
-        key_reset, key_noise, key_run = jax.random.split(key, 3)
-        obs, state = self.env.reset(key_reset, params)
-        steps = self.env.plant.episode_steps
-
-        def step(carry: Any, xs: Any) -> tuple[Any, Any]:
-            obs, state, noise, alive = carry
-            normal, key = xs
-            noise = ornstein_uhlenbeck(noise, normal, THETA, sigma)
-            action = jnp.clip(self.policy.action(actor, obs) + noise, -1.0, 1.0)
-            obs, after, _, terminated = step_with(self.env, self.policy, base, params, state, action, key)
-            return (obs, after, noise, alive & ~terminated), (state._replace(goal=()), alive)
-
-        begin = obs, state, jnp.zeros(()), jnp.ones((), bool)
-        xs = jax.random.normal(key_noise, (steps,), float), jax.random.split(key_run, steps)
-        return jax.lax.scan(step, begin, xs)[1]
-
-    def _pair(
+    def pair(
         self, actor: Any, base: LinearLaw, params: EnvParams, state: EnvState, change: jax.Array, key: chex.PRNGKey
     ) -> Pairs:
         """The pair of a state: r is held, and all but the first action's change is equal."""
@@ -136,3 +116,23 @@ class Improvement:
 
         with_change, without = jax.vmap(come)(jnp.stack([change, jnp.zeros_like(change)]))
         return Pairs(obs, self.policy.action(actor, obs), change, with_change - without)
+
+    def _visit(
+        self, actor: Any, base: LinearLaw, params: EnvParams, sigma: jax.Array, key: chex.PRNGKey
+    ) -> tuple[EnvState, jax.Array]:
+        """The states of an episode with exploration, and whether y had not diverged before; (T, ...)."""
+        key_reset, key_noise, key_run = jax.random.split(key, 3)
+        obs, state = self.env.reset(key_reset, params)
+        steps = self.env.plant.episode_steps
+
+        def step(carry: Any, xs: Any) -> tuple[Any, Any]:
+            obs, state, noise, alive = carry
+            normal, key = xs
+            noise = ornstein_uhlenbeck(noise, normal, THETA, sigma)
+            action = jnp.clip(self.policy.action(actor, obs) + noise, -1.0, 1.0)
+            obs, after, _, terminated = step_with(self.env, self.policy, base, params, state, action, key)
+            return (obs, after, noise, alive & ~terminated), (state._replace(goal=()), alive)
+
+        begin = obs, state, jnp.zeros(()), jnp.ones((), bool)
+        xs = jax.random.normal(key_noise, (steps,), float), jax.random.split(key_run, steps)
+        return jax.lax.scan(step, begin, xs)[1]

@@ -95,8 +95,8 @@ class RunFolder:
         run = cls(path, config)
         if (name := plants.base(run.config.plant)) not in plants.REGISTRY:
             raise ValueError(
-                f"{path} is a run on {name}, {was.get('reference', 'of another machine')!r} when it was made; code is "
-                "never imported because a run folder names it, so name this plant on the command line"
+                f"{path} is a run on {name} ({was.get('reference', 'a plant in Python')}); code is never imported "
+                "because a run folder names it, so name the plant on the command line, or give plant="
             )
         if name in REGISTRATIONS and was.get("sha256") != REGISTRATIONS[name].sha256:
             message = f"{path}: {REGISTRATIONS[name].reference} has changed since the run was made"
@@ -317,7 +317,7 @@ def lock(path: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         number = holder.read_text().strip() if holder.exists() else "?"
-        raise ValueError(f"{path} is being trained by process {number}; wait for its end, or stop it") from None
+        raise ValueError(f"{path} is in use by process {number}; wait until it ends, or stop it") from None
     except OSError as error:
         raise ValueError(f"{path} can't be locked: {error.strerror}") from None
     with suppress(OSError):  # on a full disk, do without the process number
@@ -416,13 +416,13 @@ def surroundings(config: TrainConfig | None = None) -> dict[str, Any]:
     """What results depend on besides the configuration; given one, also the origin of its plant if not built in."""
     packages = ("jax", "jaxlib", "flax", "optax", "numpy")
     device = jax.devices()[0]
-    source = None if config is None else REGISTRATIONS.get(plants.base(config.plant))
+    registered = None if config is None else REGISTRATIONS.get(plants.base(config.plant))
     return {
         "versions": {"jaxouter": jaxouter.__version__, "python": platform.python_version()}
         | {name: version(name) for name in packages},
         "device": {"kind": device.device_kind, "platform": device.platform, "count": jax.device_count()},
         "flags": {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "x64": bool(jax.config.read("jax_enable_x64"))},
-    } | ({} if source is None else {"plant": {"reference": source.reference, "sha256": source.sha256}})
+    } | ({} if registered is None else {"plant": {"reference": registered.reference, "sha256": registered.sha256}})
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from unittest.mock import patch
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 import jaxouter
 from jaxouter import plants, train
@@ -20,6 +22,9 @@ from jaxouter.api import Stopped, learning
 from jaxouter.evaluation import compare, evaluate, jobs
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.plants import registry
+from jaxouter.progress import Progress
+from jaxouter.training.choice import Choice
+from jaxouter.training.config import preset
 from jaxouter.training.pretraining import DifferentiableRollout
 from jaxouter.training.run import RunFolder
 from tests.additions import room
@@ -52,6 +57,24 @@ def test_what_there_is():
     with pytest.raises(AttributeError, match="has no attribute 'teach'"):
         jaxouter.teach  # noqa: B018
     assert (Path(jaxouter.__file__).parent / "py.typed").exists()
+
+
+@pytest.mark.parametrize(
+    "begin", ["import jaxouter; jaxouter.make", "import jaxouter.runtime.gymnasium", "import jaxouter.runtime.gymnax"]
+)
+def test_recorded_data_is_a_plant_for_whoever_imports_no_more_than_this(begin):
+    code = f"{begin}; from jaxouter.plants.registry import KINDS; print(*KINDS)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "gym fmu log\n", done.stderr
+
+
+def test_what_does_not_suit_the_plant_is_said_before_anything_is_learned(monkeypatch):
+    found = Choice(preset("pitch"), "identified: dead time 40", ("the dead time does not fit",))
+    monkeypatch.setattr(learning, "choose", lambda config: found)
+    out = io.StringIO()
+    with pytest.warns(learning.ChoiceWarning, match="the dead time does not fit"):
+        learning.chosen(preset("pitch"), Progress(Console(file=out)))
+    assert out.getvalue() == "pitch: identified: dead time 40\n"
 
 
 def test_a_run_is_that_of_the_command_to_the_last_bit(run, tmp_path, capsys):

@@ -176,6 +176,8 @@ def code() -> str:
     [
         "plants/pitch.py",
         "loop/observation.py",
+        "identification/lq.py",
+        "tasks/pitch.py",
         "agents/networks.py",
         "training/config.py",
         "evaluation/baselines/pi.py",
@@ -197,7 +199,7 @@ def test_results_are_made_again_when_the_source_that_they_depend_on_changes(pack
     assert make.calls == len([path for path in files() if path.suffix == ".npz"]) == 2
 
 
-def test_a_new_rival_changes_the_code_and_the_commands_do_not(package):
+def test_a_new_baseline_changes_the_code_and_the_commands_do_not(package):
     before = code()
     for source in ("compare.py", "evaluation/report.py", "evaluation/figures.py"):
         (package / source).write_text("")

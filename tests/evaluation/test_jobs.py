@@ -247,11 +247,11 @@ def test_limits_are_kept_up_to_a_thousandth_of_the_steps_or_where_there_are_none
 ALL = (*LEARNED, OTHER_RUN, USER, NONE, STATIC, ORACLE, CLAIRVOYANT)
 
 
-def test_every_entrant_meets_every_scenario():
+def test_every_entrant_is_evaluated_on_every_scenario():
     names = ["pitch/paper", "pitch/steps"]
     rest = after("pitch", ALL, names, [], 7)
-    meetings = [(job.entrant, job.on) for job in rest if job.what == "evaluate"]
-    assert meetings == [(c, on) for on in names for c in ALL]
+    evaluated = [(job.entrant, job.on) for job in rest if job.what == "evaluate"]
+    assert evaluated == [(c, on) for on in names for c in ALL]
     assert {job.family_seed for job in rest if job.what == "evaluate"} == {7}
     assert {job.plant for job in rest} == {"pitch"}
 
@@ -283,12 +283,12 @@ def test_sweeps_take_the_first_seed_of_each_run_and_nothing_with_preview():
         assert set(swept) == acting
 
 
-def test_stabilities_on_the_for_stability_that_were_asked_for():
+def test_only_scenarios_that_were_asked_for_are_analysed():
     rest = after("pitch", ALL, ["pitch/steps", "pitch/uncertainty", "pitch/paper", "pitch/noise"], [], 7)
-    certified = [(job.on, job.entrant) for job in rest if job.what == "stability"]
+    analysed = [(job.on, job.entrant) for job in rest if job.what == "stability"]
     acting = {LEARNED[0], OTHER_RUN, USER, NONE, STATIC, ORACLE}
-    assert len(certified) == 2 * len(acting)
-    assert set(certified) == {(on, c) for on in ("pitch/paper", "pitch/uncertainty") for c in acting}
+    assert len(analysed) == 2 * len(acting)
+    assert set(analysed) == {(on, c) for on in ("pitch/paper", "pitch/uncertainty") for c in acting}
     rest = after("pitch", ALL, ["pitch/steps"], [], 7)
     assert {job.what for job in rest} == {"evaluate"}
 
@@ -302,7 +302,7 @@ def assert_same_trees(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_load_gives_a_rival_as_it_was_identified():
+def test_load_gives_a_baseline_as_it_was_identified():
     policy, params = jobs.load(STATIC, "lag")
     expected = steady_state.static(*lag.make(), jax.random.key(0))
     assert policy == expected[0]
@@ -382,7 +382,7 @@ def test_users_policy_whose_arithmetic_fails_has_diverged(own):
     assert swept.found.settings["mae"] == [None] * 5  # the coarse grid of policies on the host
 
 
-def test_meet_is_the_evaluation_of_the_policy(run):
+def test_evaluate_is_the_evaluation_of_the_policy(run):
     scenario = scenarios.get("lag/ramps", family_seed=3)
     seed = Entrant("learned", "learned", str(run.path), 1)
     trainer, _ = run.trainer
@@ -399,7 +399,7 @@ def test_meet_is_the_evaluation_of_the_policy(run):
     assert jobs.evaluate(NONE, "lag", "lag/ramps", 4).settings["mae"] != found.settings["mae"]
 
 
-def test_clairvoyant_meets_a_scenario_by_its_plan(monkeypatch):
+def test_clairvoyant_is_evaluated_by_its_plan(monkeypatch):
     monkeypatch.setitem(REGISTRY, "lag", lambda: (replace(lag.LAG, episode_steps=20), lag.make()[1]))
     found = jobs.evaluate(CLAIRVOYANT, "lag", "lag/steps", 2024)
     planned = plan(scenarios.get("lag/steps"))

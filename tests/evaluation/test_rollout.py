@@ -74,7 +74,7 @@ class Failing:
 
 
 @pytest.mark.parametrize("identifier", ["pitch/noise", "heaters/load"])
-def test_host_policy_meets_the_same_episodes(identifier):
+def test_a_policy_on_the_host_runs_on_the_same_episodes(identifier):
     scenario = scenarios.get(identifier, 2)
     jitted, host = (rollout(Integrator(host), FLOAT.type(0.02), scenario) for host in (False, True))
     for name in ("y0", "y", "r_tilde", "reward"):

@@ -206,7 +206,7 @@ def test_pi_on_lag_is_exact(kp: float, ki: float, stable: bool) -> None:
 
 
 @of_single_draws
-def test_learned_policy_returns_as_fast_as_certified() -> None:
+def test_learned_policy_returns_as_fast_as_the_analysis_says() -> None:
     plant, params = lag.make(d=0.1)
     observer = Observer.of(plant, history=3)
     policy = LearnedPolicy(observer, (16, 16), 4.0)
@@ -314,7 +314,7 @@ def bare(slope: float, drift: float = 0.0) -> Plant:
     )
 
 
-def test_plant_that_declares_nothing_is_certified_too() -> None:
+def test_a_plant_that_declares_nothing_is_analysed_too() -> None:
     found = one(*none(bare(0.9)), bare(0.9), jnp.asarray(0.1), 2.0)
     assert found.y == pytest.approx(1.0, abs=1e-6)
     assert found.spectral_radius == pytest.approx(0.6, abs=1e-6)

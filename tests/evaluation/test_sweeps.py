@@ -57,7 +57,7 @@ def test_grid_of_two_axes_is_row_major():
     assert values[*at[::-1]] != pytest.approx(expected, rel=1e-2)
 
 
-def test_repeats_meet_the_same_noise_at_each_point():
+def test_repeats_have_the_same_noise_at_each_point():
     sweep = sweeps.get("heaters/x-out", coarse=True)
     traces = rollout(*none(sweep.scenario.plant), sweep.scenario)
     warmth = np.diff(traces.y.reshape(5, sweep.repeats, 200), axis=0)  # x_out acts the same on every noise

@@ -83,7 +83,7 @@ def test_under_the_recorded_input_it_is_the_record():
     assert any(np.array_equal(np.asarray(episode.y, np.float64), other.astype(FLOAT)) for other in data.y)
 
 
-def test_a_quiet_episode_has_less_noise_and_the_same_course():
+def test_a_smoothed_episode_has_less_noise_and_the_same_course():
     plant, params = plants.make("heaters")
     model = counterfactual.fit(record(plant, params, KEY, 16), 5)
     difference = np.asarray(model.y - model.smoothed)

@@ -68,7 +68,7 @@ def test_offset_is_taken_off_by_the_static_prefilter(monkeypatch: pytest.MonkeyP
         ({"K": 0.0}, "no r~ in (-4.0, 4.0) moves its output: y is the same under 8 levels of r~ from -3.5 to 3.5"),
         ({"K": float("nan")}, "y is nan from control step 1 of 50 on under r~ = -3.5"),
         ({"d": 8.0}, "y is the same under 8 levels of r~ from -3.5 to 3.5 for 80 control steps (the dead time), and"),
-        ({"K": 1e-4}, "r~ from -4 to 4 1 moves y by only 0.0007 1, but the set-points span 2 1: the gain is too small"),
+        ({"K": 1e-4}, "r~ from -4 to 4 moves y by only 0.0007, but the set-points span 2: the gain is too small"),
     ],
 )
 def test_why_a_plant_does_not_answer_is_said(overrides: dict[str, float], text: str) -> None:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from jaxouter.identification import unstable
+from jaxouter.identification.linear_models import impulse_response, radius
 from jaxouter.identification.records import Record, record, within
 from jaxouter.identification.steady_state import IdentificationWarning
 from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.policy import Linear, none
 from jaxouter.plants import simulate
+from jaxouter.plants.arx import Model
 from tests import kinds
 
 A, B = 1.08, 0.04  # y_(k+1) = A y_k + B r~_k: |y| beyond B 4 / (A - 1) = 2 can't be brought back
@@ -33,13 +35,13 @@ def diverging():
 def test_growth_is_found_in_what_is_left_of_the_record(diverging):
     plant, _, data = diverging
     model = unstable.fit(plant, data, 5)
-    assert model.growth == pytest.approx(A, rel=1e-2)
+    assert radius(model) == pytest.approx(A, rel=1e-2)
     assert np.sum(model.b) / (1.0 - np.sum(model.a)) == pytest.approx(B / (1.0 - A), rel=0.05)
 
 
 def test_continued_episodes_are_what_the_plant_would_have_done(diverging):
     plant, params, data = diverging
-    model = unstable.Model(np.array([A, 0.0, 0.0]), np.array([B, 0.0, 0.0]), 0.0)
+    model = Model(np.array([A, 0.0, 0.0]), np.array([B, 0.0, 0.0]), 0.0, 0.0)
     new = unstable.continued(plant, data, model)
     assert len(new.y) == len(data.y)
     assert np.abs(new.y[:, -10:]).max() < 0.1  # it would have come to rest
@@ -53,12 +55,12 @@ def test_continued_episodes_are_what_the_plant_would_have_done(diverging):
 @pytest.mark.parametrize(("y0", "back"), [(0.0, True), (1.8, True), (-1.9, True), (2.2, False), (-2.5, False)])
 def test_what_can_be_brought_back_is_what_the_bounds_of_r_tilde_allow(y0, back):
     plant, _ = GROWING()
-    model = unstable.Model(np.array([A]), np.array([B]), 0.0)
+    model = Model(np.array([A]), np.array([B]), 0.0, 0.0)
     y = np.append(y0, np.full(kinds.EPISODE, np.nan))
     y[1] = A * y0  # as long as the model's past
     alone = Record(np.zeros((1, kinds.EPISODE)), y[None])
     replayed = unstable.continued(plant, alone, model)
-    assert unstable.can_be_brought_back(plant, replayed, model.response(kinds.EPISODE)).tolist() == [back]
+    assert unstable.can_be_brought_back(plant, replayed, impulse_response(model, kinds.EPISODE)).tolist() == [back]
 
 
 @pytest.mark.parametrize(("dead", "least"), [(0, 15), (25, 30)])

@@ -1,4 +1,4 @@
-"""What the report says of logs whose plant is known."""
+"""Validation of models of recorded data whose plant is known."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def good() -> Validation:
     return told(recorded(*lag.make(), rows=1_200, noise=0.05))
 
 
-def test_a_good_log_is_told_to_be_one(good: Validation) -> None:
+def test_a_good_record_is_told_to_be_one(good: Validation) -> None:
     assert good.warnings == ()
     assert good.gain_range[0] - 0.005 < 0.5 < good.gain_range[1] + 0.005
     assert good.rise_time == pytest.approx(0.3 * np.log(9.0), abs=0.15)
@@ -99,5 +99,5 @@ def test_the_table_has_units_and_the_figure_is_drawn(good: Validation, tmp_path:
     rows = dict(validation.table(good, "degC"))
     assert rows["rows"].startswith("1200 of 0.1 s, ")
     assert " degC, 99." in rows["held out, free run"]
-    path = figures.save(figures.log_report(good, "log:lag.csv", "degC"), tmp_path / "log.png")
+    path = figures.save(figures.validation_figure(good, "log:lag.csv", "degC"), tmp_path / "log.png")
     assert path.stat().st_size > 20_000

@@ -87,7 +87,7 @@ def test_variables_and_settled_are_inverse() -> None:
     jax.tree.map(np.testing.assert_array_equal, again, state)
 
 
-def test_a_loop_around_it_is_certified() -> None:
+def test_a_loop_around_it_is_analysed() -> None:
     """r~ = r leaves the poles of the model: 0.5 and 0.2 of z^2 - 0.5 z - 0.2."""
     (found,) = analyse(*none(PLANT), PLANT, PARAMS, [1.0])
     assert found.spectral_radius == pytest.approx((0.5 + np.sqrt(0.25 + 0.8)) / 2, abs=1e-6)

@@ -220,6 +220,16 @@ def test_an_environment_that_ends_is_named_with_the_step(capsys, tmp_path, monke
 
 
 @pytest.mark.usefixtures("short")
+def test_an_environment_whose_step_fails_is_one_message(capsys, monkeypatch):
+    plant, params = plants.make(registry.add("gym:Short-v0"))
+    monkeypatch.setattr(Short, "step", lambda self, action: 1 / 0)
+    failed(lambda: simulate(plant, params, jnp.ones(4), jax.random.key(0)))
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith("error: plant Short-v0, control step 1 of the episode with seed")
+    assert message.endswith("ZeroDivisionError: division by zero")
+
+
+@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("dt", ["fast", -1.0, np.ones(2)])
 def test_a_control_step_that_is_none_is_refused(dt, monkeypatch):
     monkeypatch.setattr(Short, "dt", dt)

@@ -17,6 +17,7 @@ from fmpy.validation import validate_fmu
 from jaxouter import check, export, plants, train
 from jaxouter.exports import c
 from jaxouter.plants import interface, registry, simulate
+from jaxouter.plants.errors import PlantError
 from jaxouter.plants.simulators import PlantOptions
 from jaxouter.training.run import RunFolder
 from tests.training.small import TINY, small
@@ -205,6 +206,12 @@ def test_a_control_step_is_a_multiple_of_a_fixed_step_size(tmp_path):
     with pytest.raises(ValueError, match=r"--control-step is 0.12; .* multiple of the FMU's fixed .* 0.05 s"):
         registry.add(f"fmu:{path}", PlantOptions(control_step=0.12))
     assert plants.make(registry.add(f"fmu:{path}", PlantOptions(control_step=0.15)))[0].control_step == 0.15
+
+
+def test_an_fmu_that_fails_later_is_named_with_the_step_and_its_message(tmp_path):
+    plant, params = plants.make(registry.add(f"fmu:{faulty(tmp_path, 'STOP=10')}"))
+    with pytest.raises(PlantError, match=r"control step 101 .*fmi2DoStep failed"), registry.own_errors():
+        simulate(plant, params, jnp.ones(120), jax.random.key(0))
 
 
 def test_an_episode_is_over_by_the_stop_time(tmp_path):

@@ -61,7 +61,7 @@ def test_an_installed_package_offers_a_plant(tmp_path, monkeypatch):
         registry.add("basin")
 
 
-def test_a_broken_contract_names_the_function(tmp_path):
+def test_a_function_that_breaks_the_interface_is_named(tmp_path):
     source = (ROOT / "scripts" / "examples" / "tanks.py").read_text()
     for broken, text in (
         ("return state.lower\n", "output(params, state) gave"),

@@ -72,7 +72,7 @@ def test_the_gain_of_no_change_is_nothing_and_pairs_are_paired(started):
     found = jax.jit(trainer.improvement.pairs)(state.agent.actor, state.base, params, KEY)
     np.testing.assert_allclose(np.abs(found.change).max(), PAIRS.change, rtol=0.05)
     assert np.abs(found.change).min() >= 0.2 * PAIRS.change * 0.99
-    pair = jax.jit(trainer.improvement._pair)
+    pair = jax.jit(trainer.improvement.pair)
     one = jax.tree.map(lambda leaf: leaf[0], state.env)
     unchanged = pair(state.agent.actor, state.base, params, one, jnp.zeros(()), KEY)
     np.testing.assert_array_equal(unchanged.gain, 0.0)
@@ -128,6 +128,15 @@ def test_candidates_that_lose_in_the_mean_or_in_a_stratum_are_refused():
     assert float(found.gain[2]) > float(found.gain[0])
     assert float(found.worst[2]) == pytest.approx(-10.0, abs=2.5)  # 0.1 of an error of 0.1 / sqrt(100)
     np.testing.assert_allclose(found.error[0], 0.1 / 20, rtol=0.1)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e-6, 1e5])
+def test_the_verdict_on_a_candidate_is_the_same_in_any_unit(unit):
+    gains, strata = jnp.asarray(np.random.default_rng(0).normal(size=(2, 64)), float), jnp.arange(64) % 4
+    one, other = judge(gains, strata), judge(unit * gains, strata)
+    np.testing.assert_allclose(other.gain / unit, one.gain, rtol=1e-4)
+    np.testing.assert_allclose(other.error / unit, one.error, rtol=1e-4)
+    np.testing.assert_allclose(other.worst, one.worst, rtol=1e-3)
 
 
 def test_from_scratch_nothing_is_identified_but_the_static_gain(monkeypatch):

@@ -152,7 +152,7 @@ def test_saving_takes_no_more_than_its_share(monkeypatch):
 
 def test_a_folder_is_trained_by_one_process_at_a_time(tmp_path):
     run = new_run(tmp_path / "run")
-    refused = pytest.raises(ValueError, match=rf"is being trained by process {os.getpid()}")
+    refused = pytest.raises(ValueError, match=rf"is in use by process {os.getpid()}")
     with lock(run.path), refused, lock(RunFolder.open(run.path).path):
         pass
     with lock(run.path):

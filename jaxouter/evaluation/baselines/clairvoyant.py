@@ -19,7 +19,7 @@ import scipy
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.plants import Plant
-from jaxouter.plants.base import outputs
+from jaxouter.plants.base import in_words, outputs
 
 NEGLIGIBLE = 1e-9  # of the largest response: one that has died out so far is left out of the program
 MISMATCH = 1e-4  # between simulated and predicted response, of the largest so far
@@ -119,7 +119,8 @@ def _responses(
             error = np.abs(moved[i] - G @ probe).max()
             raise ValueError(
                 f"plant {scenario.plant.name!r} is not affine in r~ with additive noise (its output misses the affine "
-                f"prediction by {error:.3g} {scenario.plant.y_unit}); the clairvoyant bound exists for such plants only"
+                f"prediction by {error:.3g}{in_words(scenario.plant.y_unit)}); the clairvoyant bound exists for such "
+                "plants only"
             )
         which[alike] = len(responses)
         responses.append(scipy.sparse.csr_array(np.where(np.abs(G) > NEGLIGIBLE * np.abs(G).max(), G, 0.0)))

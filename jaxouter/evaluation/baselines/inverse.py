@@ -100,7 +100,7 @@ def fit(policy: Inverse, r_tilde: jax.Array, y: jax.Array, h: jax.Array, key: ch
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
-    """A network for each of some h, on a record as long as the budget allows; the one with the greatest return."""
+    """Fit a network for each candidate h on as long a record as the budget allows; keep that of the greatest return."""
     key_record, key_fit, key_episodes = jax.random.split(key, 3)
     key_noise = jax.random.fold_in(key, NOISE)
     history, explored = dynamics.suitable_history(plant, params, key_record)

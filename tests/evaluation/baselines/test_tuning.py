@@ -80,7 +80,7 @@ def test_score_is_the_mean_return_that_the_learner_is_trained_on_and_minus_infin
     assert score(Linear(PLANT.r_tilde_bounds), affine(jnp.nan, 0.0), episodes) == -np.inf
 
 
-def test_baselines_meet_the_noise_and_the_loads_of_the_learner():
+def test_baselines_are_tuned_under_the_noise_and_the_loads_of_the_learner():
     found = learners_episodes(PLANT, lag.make()[1], KEY)
     start, noise, load = preset("lag").disturbances, np.asarray(found.sensor.noise), np.asarray(found.load)
     assert 0.0 < noise.max() <= start.noise * SPAN / 2

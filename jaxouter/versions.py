@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
 FAULTS = {
     "0.10.2": "computes wrongly on a CPU, without a word (jax issue 39103)",
@@ -12,11 +12,14 @@ FAULTS = {
 }
 
 
-def warn(installed: str | None = None) -> None:
-    """Warn if the installed jaxlib (None: look it up) is one of `FAULTS`."""
-    installed = version("jaxlib") if installed is None else installed
+def warn() -> None:
+    """Warn if the installed jaxlib is one of `FAULTS`. A loop that runs an exported controller has none."""
+    try:
+        installed = version("jaxlib")
+    except PackageNotFoundError:
+        return
     if installed in FAULTS:
         warnings.warn(
             f"jaxlib {installed} {FAULTS[installed]}; install another: python -m pip install --upgrade jaxouter",
-            stacklevel=2,
+            stacklevel=3,  # who imports jaxouter
         )
