@@ -14,6 +14,7 @@ COMMANDS = {
     "check": "test whether a plant of your own implements the interface",
     "export": "write the controller of a run as NumPy, ONNX, StableHLO, C or FMU",
     "live": "run an outer loop around a function step(r~) -> y in real time, and learn from it",
+    "doctor": "look at versions, devices, folders and optional packages, and say what is wrong",
 }
 
 

@@ -12,6 +12,9 @@ FAULTS = {
 }
 
 
+CURE = "install another: python -m pip install --upgrade jaxouter"
+
+
 def warn() -> None:
     """Warn if the installed jaxlib is one of `FAULTS`. A loop that runs an exported controller has none."""
     try:
@@ -20,6 +23,6 @@ def warn() -> None:
         return
     if installed in FAULTS:
         warnings.warn(
-            f"jaxlib {installed} {FAULTS[installed]}; install another: python -m pip install --upgrade jaxouter",
+            f"jaxlib {installed} {FAULTS[installed]}; {CURE}",
             stacklevel=3,  # who imports jaxouter
         )

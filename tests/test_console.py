@@ -37,7 +37,7 @@ def test_an_unknown_command_is_one_line_and_status_2(name, capsys):
     with pytest.raises(SystemExit) as end:
         console.main([name])
     assert end.value.code == 2
-    told = f"error: there is no command {name!r}; the commands are: train, evaluate, compare, check, export, live\n"
+    told = f"error: there is no command {name!r}; the commands are: {', '.join(console.COMMANDS)}\n"
     assert capsys.readouterr() == ("", told)
 
 
