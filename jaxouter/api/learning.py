@@ -48,7 +48,7 @@ from jaxouter.training.choice import choose
 from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict, with_options
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.environments import TrainState
-from jaxouter.training.epochs import NotFiniteError, Pace, Row, train
+from jaxouter.training.epochs import NotFiniteError, Pace, Report, Row, train
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.resources import arithmetic, resources
 from jaxouter.training.run import FORMAT, RunFolder, add_agent, lock, write_json
@@ -79,6 +79,7 @@ def learn(
     set: Mapping[str, Any] | None = None,
     episodes: int | None = None,
     tensorboard: bool = False,
+    on_epoch: Report | None = None,
     **settings: Any,
 ) -> Run:
     """Learn an outer loop, as `python -m jaxouter.train` does, and evaluate it.
@@ -97,6 +98,8 @@ def learn(
         set: parameters of the plant, such as `{"tau": 0.7}`.
         episodes: of each scenario in the evaluation; None: the scenario's own number.
         tensorboard: whether to write TensorBoard events too.
+        on_epoch: called with the seed and the row of metrics.jsonl after each epoch. What it raises ends the training;
+            what was saved is intact.
         **settings: options of the command, such as `steps=20_000` or `pretraining={"gradient_steps": 500}`.
 
     Raises:
@@ -106,7 +109,7 @@ def learn(
     """
     with own_errors():
         config = configured(plant, preset, agent, set, {"seed": seed, **settings})
-        return training(config, out, progress=progress, episodes=episodes, events=tensorboard)
+        return training(config, out, progress=progress, episodes=episodes, events=tensorboard, on_epoch=on_epoch)
 
 
 def resume(
@@ -115,11 +118,19 @@ def resume(
     *,
     episodes: int | None = None,
     tensorboard: bool = False,
+    on_epoch: Report | None = None,
 ) -> Run:
     """Resume a run that was stopped, or that in a folder; other arguments and errors as for `learn`."""
     with own_errors():
         run = run if isinstance(run, Run) else load(run)
-        return training(run.config, resumes=run.path, progress=progress, episodes=episodes, events=tensorboard)
+        return training(
+            run.config,
+            resumes=run.path,
+            progress=progress,
+            episodes=episodes,
+            events=tensorboard,
+            on_epoch=on_epoch,
+        )
 
 
 def configured(
@@ -156,6 +167,7 @@ def training(
     progress: bool | Progress = True,
     episodes: int | None = None,
     events: bool = False,
+    on_epoch: Report | None = None,
     processes: Processes = Processes(),  # noqa: B008 - frozen
 ) -> Run:
     """Train, evaluate and draw a configuration; in all processes, of which the first writes.
@@ -166,6 +178,7 @@ def training(
         resumes: folder of a run to resume instead.
         progress, episodes: as for `learn`.
         events: whether to write TensorBoard events too.
+        on_epoch: as for `learn`.
         processes: how this process finds the others.
     """
     use_compilation_cache()
@@ -188,7 +201,7 @@ def training(
         try:
             with own_errors():
                 with run.gone_if_nothing_is_learned() if fresh else nullcontext():
-                    finals = _trained(run, resumes is not None, events, progress)
+                    finals = _trained(run, resumes is not None, events, on_epoch, progress)
                 if devices.is_first() and finals is not None:
                     report(run, finals, progress, episodes)
         except PlantError as error:
@@ -229,7 +242,9 @@ def go_on(run: RunFolder) -> str:
     return f"resume with: python -m jaxouter.train --resume {run.path}"
 
 
-def _trained(run: RunFolder, resumed: bool, events: bool, progress: Progress) -> dict[int, TrainState] | None:
+def _trained(
+    run: RunFolder, resumed: bool, events: bool, on_epoch: Report | None, progress: Progress
+) -> dict[int, TrainState] | None:
     """Train with progress, to the end or until a signal."""
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
@@ -262,6 +277,8 @@ def _trained(run: RunFolder, resumed: bool, events: bool, progress: Progress) ->
             shown.epoch(seed, row)
             if events:
                 board(seed, row)
+            if on_epoch is not None:
+                on_epoch(seed, row)
 
         finals = train(run, watch, on_row, lambda: interrupt.requested, shown.pretrained, shown.begins)
     if finals is not None:

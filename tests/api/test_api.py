@@ -33,6 +33,9 @@ ROOM = str(Path(__file__).parents[1] / "additions" / "room.py") + ":Room"
 TERM = str(Path(__file__).parents[1] / "additions" / "gentle.py") + ":Gentle"
 
 
+HEARD: list[tuple[int, dict]] = []  # of the epochs of the run
+
+
 @pytest.fixture(scope="module", autouse=True)
 def own_plants():
     with patch.dict(plants.REGISTRY), patch.dict(registry.REGISTRATIONS):
@@ -42,7 +45,9 @@ def own_plants():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "room"
-    return jaxouter.learn(ROOM, "quick", out=path, progress=False, set={"tau": 4})
+    return jaxouter.learn(
+        ROOM, "quick", out=path, progress=False, set={"tau": 4}, on_epoch=lambda *each: HEARD.append(each)
+    )
 
 
 def parameters(path: Path) -> list[np.ndarray]:
@@ -97,6 +102,11 @@ def test_its_path_config_metrics_and_summary(run):
     assert run.of_seed(0).policy.spec.plant == "Room(tau=4)"
     with pytest.raises(ValueError, match=r"seed is 7; .* has: 0"):
         run.of_seed(7)
+
+
+def test_each_epoch_was_told_with_its_row_of_the_metrics(run):
+    assert [(seed, row["epoch"]) for seed, row in HEARD] == [(0, row["epoch"]) for row in run.metrics]
+    assert [row["mae"] for _, row in HEARD] == [row["mae"] for row in run.metrics]
 
 
 def test_the_policy_and_its_controller_agree(run):
