@@ -56,7 +56,8 @@ def test_train_writes_the_run_folder(trained):
         assert [row["steps"] for row in rows] == [1120, 1600, 8000]
         assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
-    assert names == {"paper.png", "learning-curve.png", *(f"{name.replace('/', '-')}.png" for name in PLACES)}
+    drawn = ["paper", "learning-curve", *(name.replace("/", "-") for name in PLACES)]
+    assert names == {f"{name}.{kind}" for name in drawn for kind in ("png", "svg")}
     summary = json.loads((folder / "summary.json").read_text())
     assert [(r["policy"], r.get("seed")) for r in summary["results"]] == [
         ("learned", 3), ("learned", 4), ("none", None), ("static", None)

@@ -145,8 +145,9 @@ def test_csv_has_the_same_rows(compared):
 
 
 def test_figures_are_drawn_and_the_report_holds_them(compared):
-    figures = {path.name: path.read_bytes() for path in (compared.out / "figures").iterdir()}
-    assert set(figures) == {"errors.png", "effort.png", "sweep-gain.png", "stability.png", "pitch-paper.png"}
+    figures = {path.stem: path.read_bytes() for path in (compared.out / "figures").glob("*.png")}
+    assert set(figures) == {"errors", "effort", "sweep-gain", "stability", "pitch-paper"}
+    assert {path.stem for path in (compared.out / "figures").glob("*.svg")} == set(figures)
     page = (compared.out / "report.html").read_text()
     for content in figures.values():
         assert content.startswith(b"\x89PNG\r\n\x1a\n")

@@ -443,10 +443,8 @@ def draw(
         {name: found.traces for name, found in results.items()} for results in (simple["none"], learned)
     )
     for scenario in selected:
-        name = slug(scenario.id)
-        figures.save(
-            figures.response(scenario, inner_traces[scenario.id], traces[scenario.id]), run.figures / f"{name}.png"
-        )
+        name = f"{slug(scenario.id)}.png"
+        figures.keep(figures.response([scenario], inner_traces, traces), run.figures / name)
         drawn()
     maes = {name: results[selected[0].id].figures.mae for name, results in simple.items()}
     levels = {name: value for name, value in maes.items() if value is not None}
@@ -454,6 +452,6 @@ def draw(
     rows = {seed: run.rows(seed) for seed in run.seeds}
     title = f"{selected[0].id}, MAE" + in_words(selected[0].plant.y_unit, " [{}]")
     if run.config.epochs:
-        figures.save(figures.learning_curve(rows, levels, title), run.figures / "learning-curve.png")
+        figures.keep(figures.learning_curve(rows, levels, title), run.figures / "learning-curve.png")
         drawn()
-    figures.save(figures.paper(selected, inner_traces, traces), run.figures / MAIN_FIGURE)
+    figures.keep(figures.response(selected[:2], inner_traces, traces), run.figures / MAIN_FIGURE)

@@ -154,7 +154,8 @@ class Run:
         alone = policies.evaluate("none", self.config.plant, identifier, episodes=1, progress=False)
         from jaxouter.evaluation import figures  # matplotlib takes two seconds, also where nothing is drawn
 
-        figure = figures.response(scenarios.get(identifier, 1), alone[identifier].traces, found.traces)
+        of = ({identifier: each.traces} for each in (alone[identifier], found))
+        figure = figures.response([scenarios.get(identifier, 1)], *of)
         if path is not None:
             figures.save(figure, Path(path))
         return figure

@@ -264,7 +264,8 @@ def write(selection: Selection, content: Comparison, done: Sequence[Done], progr
     overall = OVERALL + len(selection.sweeps)
     progress.phase("drawing", overall + len(selection.scenarios))
     with optional("figures"):
-        figures |= comparison_figures.draw(selection.out / "figures", content)
+        unstable = [name for name in selection.scenarios if not scenarios.get(name, 1).stable_alone]
+        figures |= comparison_figures.draw(selection.out / "figures", content, unstable)
         progress.advance(overall)
         for name in selection.scenarios:
             traces = {label[c.line]: t for c, t in jobs.first_episodes(done, name).items()}

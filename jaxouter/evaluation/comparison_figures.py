@@ -11,7 +11,17 @@ import numpy as np
 import scipy
 
 from jaxouter.evaluation.drawing import Axes, Figure, Line2D, LogNorm, SubFigure
-from jaxouter.evaluation.figures import LIMIT, REFERENCE, log_axis, save, styled, symbol, times
+from jaxouter.evaluation.figures import (
+    LIMIT,
+    REFERENCE,
+    keep,
+    legend,
+    log_axis,
+    output_range,
+    styled,
+    symbol,
+    times,
+)
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.results import Comparison, StabilityRow, SweepErrors
 from jaxouter.evaluation.rollout import Traces
@@ -88,45 +98,56 @@ def _short(scenario: str) -> str:
     return scenario.split("/", 1)[-1]
 
 
-def _legend(figure: Figure, shown: Mapping[str, Style], lines_too: bool = True, **kwargs: Any) -> None:
-    """One legend for the whole figure, below it."""
+def _legend(
+    figure: Figure, shown: Mapping[str, Style], lines_too: bool = True, more: Sequence[Any] = (), most: int = 6
+) -> None:
+    """One legend for the whole figure: the policies, and `more`."""
     handles = [
         Line2D([], [], color=s.color, ls=s.ls if lines_too else "", lw=s.lw, marker=s.marker, ms=6, label=_plain(name))
         for name, s in shown.items()
     ]
-    handles += kwargs.pop("more", [])
-    columns = min(len(handles), kwargs.pop("columns", 6))
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False, **kwargs)
+    legend(figure, [*handles, *more], most)
 
 
-def errors(path: Path, comparison: Comparison) -> Path:
-    """MAE of every policy on every scenario as a multiple of the limit (without a limit: the MAE itself)."""
+def errors(path: Path, comparison: Comparison, unstable: Sequence[str] = ()) -> Path:
+    """MAE of every policy on every scenario as a multiple of the limit (without a limit: the MAE itself).
+
+    Args:
+        path: PNG.
+        comparison: what is drawn.
+        unstable: scenarios whose plant is unstable alone. They stand apart, with an axis of their own.
+    """
     every = lines(comparison.rows, comparison.policies)
     look = _styles(comparison)
-    names = scenarios(comparison.rows)
     limited = any(row.ratio_to_limit is not None for row in comparison.rows)
     key = "ratio_to_limit" if limited else "mae"
     every = [line for line in every if not (limited and line.kind == "limit")]  # 1 by definition
-    figure = Figure(figsize=(9, 1.6 + 0.46 * len(names)), layout="constrained")
-    axes = figure.subplots()
+    every_name = scenarios(comparison.rows)
+    apart = [name for name in every_name if name in unstable]
+    groups = list(filter(None, ([name for name in every_name if name not in apart], apart)))
+    heights = [len(names) for names in groups]
+    figure = Figure(figsize=(9, 1.6 + 0.46 * sum(heights) + 0.6 * len(apart[:1])), layout="constrained")
     offsets = np.linspace(-0.3, 0.3, len(every)) if len(every) > 1 else [0.0]
-    for i, name in enumerate(names):
-        axes.axhspan(i - 0.5, i + 0.5, color="#f3f3f3" if i % 2 == 0 else "#ffffff", lw=0, zorder=0)
-        for offset, line in zip(offsets, every, strict=True):
-            _dot(axes, line, look[line.label], name, key, i + offset)
-    log_axis(axes, "x")
-    if limited:
-        axes.axvline(1.0, color="#111111", ls=DASHED, lw=1.2, zorder=2)
-    axes.set_yticks(range(len(names)), [_short(name) for name in names])
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    unit = symbol(comparison.y_unit)
-    axes.set_xlabel("MAE as a multiple of the limit's" if limited else f"MAE [{unit}]")
+    grid = figure.subplots(len(groups), 1, height_ratios=heights, squeeze=False)[:, 0]
+    for axes, names in zip(grid, groups, strict=True):
+        for i, name in enumerate(names):
+            axes.axhspan(i - 0.5, i + 0.5, color="#f3f3f3" if i % 2 == 0 else "#ffffff", lw=0, zorder=0)
+            for offset, line in zip(offsets, every, strict=True):
+                _dot(axes, line, look[line.label], name, key, i + offset)
+        log_axis(axes, "x")
+        if limited:
+            axes.axvline(1.0, color="#111111", ls=DASHED, lw=1.2, zorder=2)
+        axes.set_yticks(range(len(names)), [_short(name) for name in names])
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        if names == apart:
+            axes.set_title("unstable alone", fontsize=10, loc="left")
+    grid[-1].set_xlabel("MAE as a multiple of the limit's" if limited else f"MAE [{symbol(comparison.y_unit)}]")
     hollow = Line2D([], [], color="#555555", marker="o", mfc="white", ls="", ms=6, label="hollow: outside the limits")
     limit = [Line2D([], [], color="#111111", ls=DASHED, lw=1.2, label="the limit")] if limited else []
     diverged = Line2D([], [], ls="", marker="$\\rightarrow$", color="#555555", ms=8, label="diverged")
     shown = {line.label: look[line.label] for line in every}
-    _legend(figure, shown, lines_too=False, more=[*limit, hollow, diverged], columns=5)
-    return save(styled(figure), path)
+    _legend(figure, shown, lines_too=False, more=[*limit, hollow, diverged], most=5)
+    return keep(styled(figure), path)
 
 
 def _dot(axes: Axes, line: Line, style: Style, scenario: str, key: str, height: float) -> None:
@@ -185,7 +206,7 @@ def effort(path: Path, comparison: Comparison) -> Path:
     figure.set_layout_engine("none")  # labels find their places in a layout that stays
     for axes, points in shown:
         _label(figure, axes, points, look)
-    return save(styled(figure), path)
+    return keep(styled(figure), path)
 
 
 def _mean_over(line: Line, names: Sequence[str], key: str) -> float | None:
@@ -254,7 +275,7 @@ def sweep(path: Path, comparison: Comparison, identifier: str) -> Path:
     """MAE over a swept parameter, relative to the policy's own nominal and to the best baseline there."""
     content = comparison.sweeps[identifier]
     draw = _curves if len(content.axes) == 1 else _maps
-    return save(styled(draw(content, _styles(comparison))), path)
+    return keep(styled(draw(content, _styles(comparison))), path)
 
 
 class _Ratios(NamedTuple):
@@ -313,7 +334,7 @@ def _curves(content: SweepErrors, look: Mapping[str, Style]) -> Figure:
         axes.set_ylabel("MAE ratio")
         axes.set_title(f"MAE {title}", fontsize=10, loc="left", pad=6 + 8 * lost)
     gone = Line2D([], [], ls="", marker="|", color="#555555", ms=6, mew=1.4, label="above the frame: diverged")
-    _legend(figure, {name: look[name] for name in names}, more=[gone], columns=6)
+    _legend(figure, {name: look[name] for name in names}, more=[gone])
     return figure
 
 
@@ -413,7 +434,8 @@ def responses(path: Path, scenario: Scenario, traces: Mapping[str, Traces], name
         top.plot(t, np.append(own.y0[0], own.y[0]), **style)
         handles += [Line2D([], [], label=label, **style)]
         bottom.step(t, np.append(own.r_tilde[0], own.r_tilde[0, -1]), where="post", **style | dict(lw=0.8 * s.lw))
-    top.set_ylim(*_range(scenario, traces))
+    outer = [own for name, own in traces.items() if name != "none"]  # the inner loop alone may leave the picture
+    top.set_ylim(*output_range(scenario, outer or [first]))
     (r,) = top.step(t, np.append(first.r[0], first.r[0, -1]), where="post", color=REFERENCE, lw=1.1, zorder=6)
     r.set_label("reference r")
     limits = [] if plant.output_limit is None else [-plant.output_limit, plant.output_limit]
@@ -430,20 +452,7 @@ def responses(path: Path, scenario: Scenario, traces: Mapping[str, Traces], name
     handles += [r, Line2D([], [], label="limits of y, bounds of r̃" if limits else "bounds of r̃", **red)]
     title = f"MAE of all episodes [{unit}]"
     figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title=title, title_fontsize=9)
-    return save(styled(figure), path)
-
-
-def _range(scenario: Scenario, traces: Mapping[str, Traces]) -> tuple[float, float]:
-    """Range of y that shows r and the outer loops; the inner loop alone, and what runs away, may leave the picture."""
-    low, high = scenario.plant.evaluation_range
-    low, high = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
-    if scenario.stable_alone:
-        low, high = min(low, scenario.plant.divergence_bounds[0]), max(high, scenario.plant.divergence_bounds[1])
-    outer = [own for name, own in traces.items() if name != "none"] or [*traces.values()]
-    shown = np.concatenate([outer[0].r[0], *(np.append(own.y0[0], own.y[0]) for own in outer)])
-    shown = np.clip(shown[np.isfinite(shown)], low, high)
-    margin = 0.06 * (shown.max() - shown.min()) + 1e-6 * scenario.plant.error_scale
-    return float(shown.min() - margin), float(shown.max() + margin)
+    return keep(styled(figure), path)
 
 
 def stability(path: Path, comparison: Comparison) -> Path:
@@ -474,8 +483,8 @@ def stability(path: Path, comparison: Comparison) -> Path:
         if i % columns == 0:
             axes.set_ylabel("spectral radius")
     unstable = Line2D([], [], ls="", marker="o", mfc="white", mec=LIMIT, ms=6, mew=1.4, label="hollow red: unstable")
-    _legend(figure, {policy: look[policy] for policy in policies}, more=[unstable], columns=6)
-    return save(styled(figure), path)
+    _legend(figure, {policy: look[policy] for policy in policies}, more=[unstable])
+    return keep(styled(figure), path)
 
 
 def _radii(axes: Axes, rows: Sequence[StabilityRow], style: Style) -> None:
@@ -486,9 +495,10 @@ def _radii(axes: Axes, rows: Sequence[StabilityRow], style: Style) -> None:
     axes.plot(x[bad], radius[bad], **mark, zorder=style.zorder + 0.1)
 
 
-def draw(folder: Path, comparison: Comparison) -> dict[str, Path]:
-    """Every figure of a comparison but the time responses, by the id that the report knows it by."""
-    found = {"errors": errors(folder / "errors.png", comparison), "effort": effort(folder / "effort.png", comparison)}
+def draw(folder: Path, comparison: Comparison, unstable: Sequence[str] = ()) -> dict[str, Path]:
+    """Every figure of a comparison but the time responses, by the id that the report knows it by; see `errors`."""
+    found = {"errors": errors(folder / "errors.png", comparison, unstable)}
+    found |= {"effort": effort(folder / "effort.png", comparison)}
     for identifier in comparison.sweeps:
         path = folder / f"sweep-{_short(identifier).replace('/', '-')}.png"
         found[f"sweep {identifier}"] = sweep(path, comparison, identifier)

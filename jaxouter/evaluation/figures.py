@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxouter.evaluation.drawing import DPI, Axes, Figure, LogLocator, NullFormatter
+from jaxouter.evaluation.drawing import DPI, Axes, Figure, LogLocator, NullFormatter, rc_context
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
@@ -21,6 +21,9 @@ INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#
 UNITS = {"degC": "°C"}
 HELD_OUT_ROWS = 600  # that are drawn
 LIVE_ROWS = 600  # the same, at either end
+LETTER, HANDLE = 0.067, 0.62  # widths in a legend, inches
+LIMITS: dict[str, Any] = dict(color=LIMIT, ls=":", lw=1.2, label="limits of y, bounds of r̃")
+WIDE, NARROW = (dict[str, Any](color=LEARNED, alpha=alpha, lw=0) for alpha in (0.12, 0.25))
 
 
 def styled(figure: Figure) -> Figure:
@@ -35,6 +38,13 @@ def save(figure: Figure, path: Path) -> Path:
     """Write the figure, in the format that the path's suffix names; makes the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=DPI)
+    return path
+
+
+def keep(figure: Figure, path: Path) -> Path:
+    """Write a figure of a run or a report as PNG, to the path that is returned, and as SVG beside it."""
+    with rc_context({"svg.hashsalt": "jaxouter"}):  # else each time another file
+        figure.savefig(save(figure, path).with_suffix(".svg"), metadata={"Date": None})
     return path
 
 
@@ -61,40 +71,118 @@ def times(scenario: Scenario, steps: int) -> np.ndarray:
     return scenario.plant.control_step * np.arange(steps + 1)
 
 
-def _output(axes: Axes, scenario: Scenario, traces: Traces, color: str, label: str) -> None:
-    """Y of the first episode, r, and the limits on y."""
-    t, unit = times(scenario, traces.r.shape[1]), symbol(scenario.plant.y_unit)
-    limit = scenario.plant.output_limit
+def legend(figure: Figure, handles: Sequence[Any] | None = None, most: int = 6) -> None:
+    """One legend for the whole figure, below it, in as many columns as there is room for.
+
+    Args:
+        figure: with all its axes.
+        handles: with their labels; None: those of the axes, each label once.
+        most: columns.
+    """
+    if handles is None:
+        drawn = [handle for axes in figure.axes for handle in axes.get_legend_handles_labels()[0]]
+        handles = [*{str(handle.get_label()): handle for handle in reversed(drawn)}.values()][::-1]
+    widths = [HANDLE + LETTER * len(str(handle.get_label())) for handle in handles]
+    wide = {n: sum(map(max, np.array_split(widths, n))) for n in range(min(len(handles), most), 1, -1)}
+    columns = next((n for n, width in wide.items() if width < figure.get_figwidth()), 1)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False)
+
+
+def response(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: Mapping[str, Traces]) -> Figure:
+    """The first episode of each scenario, a column each: r and y, alone and with the learned outer loop, above r~.
+
+    A plant with a rate limit has a third row, the changes of y from one control step to the next.
+
+    Args:
+        scenarios: one or two of a plant.
+        inner, learned: by the scenarios' ids.
+    """
+    plant = scenarios[0].plant
+    rates = plant.rate_limit is not None
+    heights = (1.6, 1.0, 1.0) if rates else (1.6, 1.0)
+    figure = Figure(figsize=(2.0 + 4.6 * len(scenarios), 1.2 + 1.7 * sum(heights)), layout="constrained")
+    grid = figure.subplots(len(heights), len(scenarios), sharex="col", squeeze=False, height_ratios=heights)
+    unit, time = symbol(plant.y_unit), plant.time_unit
+    for column, scenario in zip(grid.T, scenarios, strict=True):
+        alone, own = inner[scenario.id], learned[scenario.id]
+        _outputs(column[0], scenario, alone, own)
+        _modified(column[1], scenario, own)
+        if rates:
+            _changes(column[2], scenario, own)
+            column[2].set_ylim(bottom=0)
+        short = scenario.id.rpartition("/")[2]  # the plant's name, which may be long, stands above all
+        column[0].set_title(f"{short}: MAE {mae(alone):.3g} alone, {mae(own):.3g} learned", fontsize=10, loc="left")
+        column[-1].set_xlabel(f"time [{time}]")
+    labels = [f"y [{unit}]", f"r̃ [{unit}]", f"|Δy| [{unit}/{time}]"]
+    for axes, label in zip(grid[:, 0], labels, strict=False):
+        axes.set_ylabel(label)
+    figure.suptitle(plant.name, fontsize=11)
+    legend(figure)
+    return styled(figure)
+
+
+def _outputs(axes: Axes, scenario: Scenario, alone: Traces, learned: Traces) -> None:
+    """Y of the first episode of both, r, and the limits on y."""
+    t, limit = times(scenario, alone.r.shape[1]), scenario.plant.output_limit
+    _members(axes, scenario, learned)
     if limit is not None:
-        for i, bound in enumerate((-limit, limit)):
-            axes.axhline(bound, color=LIMIT, ls=":", lw=1.2, label=f"limit ±{limit:g} {unit}" if i else None)
-    axes.step(
-        t, np.append(traces.r[0], traces.r[0, -1]), where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r"
-    )
-    y = np.append(traces.y0[0], traces.y[0])
-    axes.plot(t, y, color=color, lw=1.8, label=label)
-    axes.set_ylabel(f"y [{unit}]")
-    if not scenario.stable_alone:  # what runs away must not squeeze the rest into a line
-        low, high = scenario.plant.evaluation_range
-        axes.set_ylim(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low)
+        for bound in (-limit, limit):
+            axes.axhline(bound, **LIMITS)
+    r = np.append(alone.r[0], alone.r[0, -1])
+    axes.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r")
+    both = {"y, inner loop alone": (alone, INNER), "y, learned outer loop": (learned, LEARNED)}
+    for label, (traces, color) in both.items():
+        axes.plot(t, np.append(traces.y0[0], traces.y[0]), color=color, lw=1.8, label=label)
+    low, high = scenario.plant.divergence_bounds
+    every = np.concatenate([alone.y[0], learned.y[0]])
+    if not scenario.stable_alone or not ((every > low) & (every < high)).all():
+        axes.set_ylim(*output_range(scenario, (alone, learned)))
+        for traces, color in both.values():
+            _diverges(axes, t[1:], traces.y[0], color)
     axes.set_xlim(t[0], t[-1])
+
+
+def _diverges(axes: Axes, t: np.ndarray, y: np.ndarray, color: str) -> None:
+    """Say so where y leaves the frame and does not come back to stay."""
+    low, high = axes.get_ylim()
+    outside = ~((y >= low) & (y <= high))
+    if not outside[-(len(y) // 3) :].any():
+        return
+    k = int(np.argmax(outside))
+    above = bool(y[k] > high) if np.isfinite(y[k]) else bool(y[max(k - 1, 0)] > (low + high) / 2)
+    right = k < len(y) / 2  # where there is room for the word
+    axes.annotate(
+        "diverges",
+        (t[k], high if above else low),
+        xytext=(4 if right else -4, -10 if above else 4),
+        textcoords="offset points",
+        ha="left" if right else "right",
+        fontsize=8.5,
+        color=color,
+        bbox=dict(fc="white", alpha=0.85, lw=0, pad=1.0),
+        zorder=4,
+    )
+
+
+def output_range(scenario: Scenario, traces: Sequence[Traces]) -> tuple[float, float]:
+    """Range of y that shows r and these outputs; what runs away leaves the picture."""
+    low, high = scenario.plant.evaluation_range
+    low, high = 1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low
+    if scenario.stable_alone:
+        low, high = min(low, scenario.plant.divergence_bounds[0]), max(high, scenario.plant.divergence_bounds[1])
+    shown = np.concatenate([traces[0].r[0], *(np.append(own.y0[0], own.y[0]) for own in traces)])
+    shown = np.clip(shown[np.isfinite(shown)], low, high)
+    margin = 0.06 * (shown.max() - shown.min()) + 1e-6 * scenario.plant.error_scale
+    return float(shown.min() - margin), float(shown.max() + margin)
 
 
 def _modified(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """r~ of the first episode and its bounds."""
-    t, unit = times(scenario, traces.r.shape[1]), symbol(scenario.plant.y_unit)
-    low, high = scenario.plant.r_tilde_bounds
-    for i, bound in enumerate((low, high)):
-        axes.axhline(bound, color=LIMIT, ls=":", lw=1.2, label=f"bounds of r̃ [{low:g}, {high:g}] {unit}" if i else None)
-    axes.step(
-        t,
-        np.append(traces.r_tilde[0], traces.r_tilde[0, -1]),
-        where="post",
-        color=MODIFIED,
-        lw=1.4,
-        label="modified reference r̃",
-    )
-    axes.set_ylabel(f"r̃ [{unit}]")
+    t = times(scenario, traces.r.shape[1])
+    for bound in scenario.plant.r_tilde_bounds:
+        axes.axhline(bound, **LIMITS)
+    r_tilde = np.append(traces.r_tilde[0], traces.r_tilde[0, -1])
+    axes.step(t, r_tilde, where="post", color=MODIFIED, lw=1.4, label="modified reference r̃, learned")
     axes.set_xlim(t[0], t[-1])
 
 
@@ -104,96 +192,21 @@ def _members(axes: Axes, scenario: Scenario, traces: Traces) -> None:
         return
     t = times(scenario, traces.r.shape[1])[1:]
     quantiles = np.quantile(traces.members[0], [0.0, 0.05, 0.95, 1.0], axis=1)
-    axes.fill_between(t, quantiles[0], quantiles[3], color=LEARNED, alpha=0.12, lw=0, label="all members")
-    axes.fill_between(t, quantiles[1], quantiles[2], color=LEARNED, alpha=0.25, lw=0, label="90 % of the members")
+    axes.fill_between(t, quantiles[0], quantiles[3], label="all members, learned", **WIDE)
+    axes.fill_between(t, quantiles[1], quantiles[2], label="90 % of the members", **NARROW)
 
 
 def _changes(axes: Axes, scenario: Scenario, traces: Traces) -> None:
     """|change| a control step of y and of the single outputs, against the rate limit."""
-    t, unit = times(scenario, traces.r.shape[1])[1:], symbol(scenario.plant.y_unit)
+    t, limit = times(scenario, traces.r.shape[1])[1:], scenario.plant.rate_limit
     if traces.members is not None:
         change = np.abs(np.diff(traces.members[0], axis=0))
-        axes.fill_between(t[1:], 0, change.max(1), color=LEARNED, alpha=0.12, lw=0, label="largest of all members")
-        axes.fill_between(
-            t[1:], 0, np.quantile(change, 0.95, axis=1), color=LEARNED, alpha=0.25, lw=0, label="95 % of the members"
-        )
-    axes.plot(t, np.abs(np.diff(traces.y[0], prepend=traces.y0[0])), color=LEARNED, lw=1.6, label="mean y")
-    limit = scenario.plant.rate_limit
+        axes.fill_between(t[1:], 0, change.max(1), **WIDE)
+        axes.fill_between(t[1:], 0, np.quantile(change, 0.95, axis=1), **NARROW)
+    axes.plot(t, np.abs(np.diff(traces.y[0], prepend=traces.y0[0])), color=LEARNED, lw=1.6)
     if limit is not None:
-        axes.axhline(limit, color=LIMIT, ls=":", lw=1.2, label=f"limit {limit:g} {unit}/{scenario.plant.time_unit}")
-    axes.set_ylabel(f"|Δy| [{unit}/{scenario.plant.time_unit}]")
+        axes.axhline(limit, **LIMITS)
     axes.set_xlim(0, t[-1])
-
-
-def _finish(axes: Axes, scenario: Scenario, title: str = "", last: bool = True) -> None:
-    if title:
-        axes.set_title(title, fontsize=10, loc="left")
-    if last:
-        axes.set_xlabel(f"time [{scenario.plant.time_unit}]")
-    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
-
-
-def response(scenario: Scenario, inner: Traces, learned: Traces) -> Figure:
-    """r, y and r~ over time with the bounds: the inner loop alone beside the learned outer loop."""
-    rates = scenario.plant.rate_limit is not None
-    figure = Figure(figsize=(10, 8.4 if rates else 6), layout="constrained")
-    grid = figure.subplots(3 if rates else 2, 2, sharex=True, sharey="row", squeeze=False)
-    unit = symbol(scenario.plant.y_unit)
-    for column, (name, traces) in enumerate((("inner loop alone", inner), ("learned outer loop", learned))):
-        _members(grid[0, column], scenario, traces)
-        _output(grid[0, column], scenario, traces, INNER if column == 0 else LEARNED, "output y")
-        _finish(grid[0, column], scenario, f"{name}: MAE {mae(traces):.3g} {unit}", last=False)
-        _modified(grid[1, column], scenario, traces)
-        _finish(grid[1, column], scenario, last=not rates)
-        if rates:
-            _changes(grid[2, column], scenario, traces)
-            _finish(grid[2, column], scenario)
-    if rates:
-        grid[2, 0].set_ylim(bottom=0)
-    figure.suptitle(scenario.id, fontsize=11)
-    return styled(figure)
-
-
-def paper(scenarios: Sequence[Scenario], inner: Mapping[str, Traces], learned: Mapping[str, Traces]) -> Figure:
-    """The paper's figure, (a) to (d), of a plant; of other plants (a) and (b) of the first scenario.
-
-    Pitch: inner loop and learned loop, nominal and delayed. Heaters: inner loop and learned loop with 4 houses, the
-    learned loop with 1000, and their change of temperature an hour.
-    """
-    heaters = scenarios[0].plant.members is not None
-    panels: list[tuple[Scenario, str, Traces]] = []
-    for scenario in scenarios:
-        both = [
-            (scenario, "inner loop alone", inner[scenario.id]),
-            (scenario, "learned outer loop", learned[scenario.id]),
-        ]
-        panels += both[1:] * 2 if heaters and panels else both
-    panels = panels[:4]
-    figure = Figure(figsize=(10, 3.4 * len(panels) / 2), layout="constrained")
-    grid = np.ravel(figure.subplots(len(panels) // 2, 2))
-    for axes, letter, (scenario, name, traces) in zip(grid, "abcd", panels, strict=False):
-        short = scenario.id.rpartition("/")[2]  # the plant's name, which may be long, stands above all panels
-        title = f"({letter}) {short}, {name}: MAE {mae(traces):.3g} {symbol(scenario.plant.y_unit)}"
-        if heaters and letter == "d":
-            _changes(axes, scenario, traces)
-            axes.set_ylim(bottom=0)
-            title = f"({letter}) {short}, {name}: change per {scenario.plant.time_unit}"
-        else:
-            if name == "learned outer loop":
-                _members(axes, scenario, traces)
-            _output(axes, scenario, traces, INNER if name == "inner loop alone" else LEARNED, "output y")
-            if name == "learned outer loop":
-                axes.step(
-                    times(scenario, traces.r.shape[1])[:-1],
-                    traces.r_tilde[0],
-                    where="post",
-                    color=MODIFIED,
-                    lw=0.8,
-                    label="modified reference r̃",
-                )
-        _finish(axes, scenario, title)
-    figure.suptitle(scenarios[0].plant.name, fontsize=11)
-    return styled(figure)
 
 
 def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapping[str, float], title: str) -> Figure:
@@ -205,18 +218,18 @@ def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapp
         levels: horizontal lines by name, such as the MAE of the static prefilter.
         title: what the MAE is of.
     """
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = Figure(figsize=(9, 3.9), layout="constrained")
     left, right = figure.subplots(1, 2)
     explored = any("reward" in row for of_seed in rows.values() for row in of_seed)
     for seed, of_seed in rows.items():
         updates = [row["updates"] / 1000 for row in of_seed]
-        left.plot(updates, [row["mae"] for row in of_seed], lw=1.6, label=f"learned, seed {seed}")
+        left.plot(updates, [row["mae"] for row in of_seed], lw=1.6, label=f"seed {seed}")
         if explored:
             gained = [row.get("reward", math.nan) for row in of_seed]
         else:
             rounds = [row["gain"] if row.get("kept") and "rate" in row else 0.0 for row in of_seed]
             gained = np.cumsum(rounds).tolist()
-        right.plot(updates, gained, lw=1.6, label=f"seed {seed}")
+        right.plot(updates, gained, lw=1.6)
     for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
         left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
     left.set_ylabel("MAE without exploration")
@@ -225,7 +238,7 @@ def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapp
     right.set_ylabel("reward a step, with exploration" if explored else "gain in reward a step, kept by the gate")
     for axes in (left, right):
         axes.set_xlabel("updates [thousand]")
-        axes.legend(fontsize=7.5, framealpha=0.85)
+    legend(figure)
     return styled(figure)
 
 
@@ -240,7 +253,7 @@ def step_responses(plant: Plant, moves: np.ndarray, responses: np.ndarray) -> Fi
         below.plot(time, [0.0, *(response / move)], **style)
     above.set(ylabel=f"change of y, {unit}", title=f"{plant.name}: response to a move of r̃ at 0")
     below.set(ylabel="change of y by that of r̃", xlabel=f"time, {plant.time_unit}")
-    above.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.legend(*above.get_legend_handles_labels(), loc="outside right upper", fontsize=8.5, frameon=False)
     return styled(figure)
 
 
@@ -267,8 +280,7 @@ def live(steps: Mapping[str, np.ndarray], unit: str = "1") -> Figure:
         below.set_xlabel("time [s]")
     grid[0, 0].set_ylabel(f"y{told}")
     grid[1, 0].set_ylabel(f"r̃{told}")
-    for axes in grid[:, 0]:
-        axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
+    legend(figure)
     return styled(figure)
 
 
@@ -288,6 +300,7 @@ def validation_figure(report: Validation, title: str, y_unit: str = "1", time_un
     _levels(figure.add_subplot(grid[1, 1]), report, unit)
     _frequencies(figure.add_subplot(grid[1, 2]), report, time_unit)
     figure.suptitle(title, fontsize=11)
+    legend(figure)
     return styled(figure)
 
 
@@ -298,44 +311,40 @@ def _held_out(axes: Axes, report: Validation, unit: str, time_unit: str) -> None
     t = curves.time[shown]
     axes.fill_between(t, *curves.band[:, shown], color=LEARNED, alpha=0.2, lw=0, label="90 % of the ensemble")
     axes.plot(t, curves.y[shown], color=REFERENCE, lw=1.0, label="y, recorded")
-    axes.plot(t, curves.free_run[shown], color=LEARNED, lw=1.4, label="nominal model, free run")
+    axes.plot(t, curves.free_run[shown], color=LEARNED, lw=1.4, label="nominal model")
     axes.set_ylabel(f"y{unit}")
     axes.set_xlabel(f"time [{time_unit}]")
     axes.set_xlim(t[0], t[-1])
     told = f"{max(report.fit_free_run, 0.0):.1%} of the variance, {report.coverage:.0%} in the band"
     axes.set_title(f"rows not fitted: {told}", fontsize=10, loc="left")
-    axes.legend(fontsize=7.5, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
 
 
 def _step_responses(axes: Axes, report: Validation, time_unit: str) -> None:
     nominal, *members = report.curves.responses
     t = report.control_step * np.arange(len(nominal))
     for i, member in enumerate(members):
-        axes.plot(t, member, color=LEARNED, lw=0.8, alpha=0.35, label=None if i else "members")
-    axes.plot(t, nominal, color=REFERENCE, lw=1.4, label="nominal")
-    axes.axvline(report.settling_time, color=INNER, ls=":", lw=1.2, label=f"settled {report.settling_time:.3g}")
+        axes.plot(t, member, color=LEARNED, lw=0.8, alpha=0.35, label=None if i else "models of the ensemble")
+    axes.plot(t, nominal, color=LEARNED, lw=1.4)
+    axes.axvline(report.settling_time, color=INNER, ls=":", lw=1.2, label=f"settled, after {report.settling_time:.3g}")
     axes.set_title(f"y after r̃ steps by 1: gain {report.gain:.3g}", fontsize=10, loc="left")
     axes.set_xlabel(f"time [{time_unit}]")
     axes.set_xlim(0, t[-1])
-    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
 
 
 def _levels(axes: Axes, report: Validation, unit: str) -> None:
     edges, levels = report.curves.edges, report.curves.levels
     axes.bar(edges[:-1], 100.0 * levels, np.diff(edges), align="edge", color=MODIFIED, alpha=0.75)
     for i, (low, high) in enumerate(report.levels_unseen):
-        axes.axvspan(low, high, color=LIMIT, alpha=0.12, lw=0, label=None if i else "never seen")
+        axes.axvspan(low, high, color=LIMIT, alpha=0.12, lw=0, label=None if i else "levels never seen")
     axes.set_xlim(edges[0], edges[-1])
     axes.set_xlabel(f"r̃{unit}")
     axes.set_ylabel("share of the time [%]")
     axes.set_title(f"levels of r̃: {report.levels_seen:.0%} seen, {report.moves} moves", fontsize=10, loc="left")
-    if report.levels_unseen:
-        axes.legend(fontsize=7.5, framealpha=0.85, loc="best")
 
 
 def _frequencies(axes: Axes, report: Validation, time_unit: str) -> None:
     curves = report.curves
-    axes.axvspan(curves.frequency[0], report.needed, color=LEARNED, alpha=0.1, lw=0, label="needed")
+    axes.axvspan(curves.frequency[0], report.needed, color=LEARNED, alpha=0.1, lw=0, label="frequencies needed")
     axes.plot(curves.frequency, curves.coherence, color=LEARNED, lw=1.4, label="coherence of r̃ and y")
     axes.plot(curves.frequency, curves.power / curves.power.max(), color=MODIFIED, lw=1.0, label="power of r̃, relative")
     axes.axhline(COHERENT, color=INNER, ls=":", lw=1.2)
@@ -343,4 +352,3 @@ def _frequencies(axes: Axes, report: Validation, time_unit: str) -> None:
     axes.set_ylim(0, 1.05)
     axes.set_xlabel(f"frequency [1/{time_unit}]")
     axes.set_title(f"{report.excited_share:.0%} of the needed frequencies shown", fontsize=10, loc="left")
-    axes.legend(fontsize=7.5, framealpha=0.85, loc="best")

@@ -22,13 +22,56 @@ def houses():
 
 def test_the_houses_and_their_comfort_limit_are_drawn(houses, tmp_path):
     selected, traces = houses
-    sizes = [figures.save(figures.paper(selected, traces, traces), tmp_path / "paper.png").stat().st_size]
     bare = {name: of._replace(members=None) for name, of in traces.items()}
+    sizes = []
     for each, name in ((traces, "houses.png"), (bare, "mean.png")):
-        path = figures.save(figures.response(selected[1], each[selected[1].id], each[selected[1].id]), tmp_path / name)
+        path = figures.keep(figures.response(selected, each, each), tmp_path / name)
         assert path.read_bytes().startswith(b"\x89PNG")
         sizes.append(path.stat().st_size)
-    assert sizes[1] > 1.02 * sizes[2]  # a picture of the houses holds more
+    assert sizes[0] > 1.02 * sizes[1]  # a picture of the houses holds more
+    drawn = (tmp_path / "houses.svg").read_bytes()
+    figures.keep(figures.response(selected, traces, traces), tmp_path / "again.png")
+    assert drawn.startswith(b"<?xml")
+    assert (tmp_path / "again.svg").read_bytes() == drawn
+
+
+def texts(figure) -> list[str]:
+    return [text.get_text() for axes in figure.axes for text in axes.texts]
+
+
+def test_a_figure_has_one_legend_outside_its_axes_and_both_loops_share_one(houses):
+    selected, traces = houses
+    figure = figures.response(selected, traces, traces)
+    assert all(axes.get_legend() is None for axes in figure.axes)
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.texts]
+    assert len(labels) == len(set(labels)) == 7
+    figure.draw_without_rendering()
+    box = legend.get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+    names = {line.get_label() for line in figure.axes[0].lines}
+    assert {"y, inner loop alone", "y, learned outer loop", "reference r"} <= names
+    assert [axes.get_ylabel() for axes in figure.axes[::2]] == ["y [°C]", "r̃ [°C]", "|Δy| [°C/h]"]
+    assert texts(figure) == []
+
+
+def test_what_leaves_the_frame_for_good_is_said_to_diverge():
+    scenario = scenarios.get("pitch/delay-5.7", 1)
+    r = np.asarray(scenario.r, float)
+    k = np.arange(r.shape[1])
+    alone, held, gone = r * 0.3, r * (1 - 0.9**k), 1.05**k * np.sin(k / 5.0)[None]
+    gone[0, -20:] = np.nan
+
+    def traces(y):
+        return {scenario.id: Traces(y[:, 0], r, y, r, -np.abs(r - y), None, None, None)}
+
+    figure = figures.response([scenario], traces(alone), traces(gone))
+    assert texts(figure) == ["diverges"]
+    low, high = figure.axes[0].get_ylim()
+    assert -60.0 < low < high < 60.0
+    assert texts(figures.response([scenario], traces(alone), traces(held))) == []
 
 
 def test_a_learning_curve_has_a_line_a_seed_and_the_levels(tmp_path):
