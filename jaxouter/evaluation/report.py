@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
+import scipy
 
 from jaxouter.evaluation.figures import symbol
 from jaxouter.evaluation.metrics import significant
 from jaxouter.evaluation.results import Comparison, LineSummary, StabilityRow, Summary
 from jaxouter.evaluation.statistics import Line, lines, scenarios
+from jaxouter.plants.base import in_words
 
 KIND_NAMES = {
     "learned": "learned",
@@ -39,6 +41,8 @@ const show = () => {
   image.alt = figure.querySelector("figcaption").textContent = caption;
 };
 select.addEventListener("change", show);
+for (const link of document.querySelectorAll("[data-choose]"))
+  link.addEventListener("click", () => { select.value = link.dataset.choose; show(); });
 show();
 """
 TERMS = (
@@ -148,21 +152,28 @@ def short(scenario: str) -> str:
     return scenario.split("/", 1)[-1]
 
 
+def leaders(summary: Summary) -> tuple[str | None, str | None]:
+    """The line that the answer is about, the best learned one if there is any, and the best of all others."""
+    ranks = {label: line.mean_rank for label, line in summary.lines.items() if line.mean_rank is not None}
+    by_rank = sorted(ranks, key=ranks.__getitem__)
+    learned = [label for label in by_rank if summary.lines[label].kind == "learned"]
+    about = next(iter(learned or by_rank), None)
+    others = (label for label in by_rank if label not in (learned or [about]))
+    return about, next(others, None)
+
+
 def answer(summary: Summary, count: int) -> str:
     """Two sentences: which policy is best on so many scenarios, and how far from the limit it is."""
     ranked = {label: (line, line.mean_rank) for label, line in summary.lines.items() if line.mean_rank is not None}
-    if not ranked:
+    about, other = leaders(summary)
+    if about is None:
         return "No policy was ranked. There is nothing to compare the limit with."
-    by_rank = sorted(ranked, key=lambda label: ranked[label][1])
-    learned = [label for label in by_rank if ranked[label][0].kind == "learned"]
-    about = learned[0] if learned else by_rank[0]
-    others = [label for label in by_rank if label not in (learned or [about])]
     own, rank = ranked[about]
     place = f"the lowest MAE within the limits in {own.first} of {_count(count, 'scenario')}, mean rank {figure(rank)}"
-    if not others:
+    if other is None:
         first = f"{about} has {place}; nothing else was ranked"
     else:
-        other, (theirs, their_rank) = others[0], ranked[others[0]]
+        theirs, their_rank = ranked[other]
         better, equal = rank < their_rank, rank == their_rank
         verdict = "is the best on the whole" if better else "shares the first place" if equal else "is not the best"
         which = "the next" if better else "its equal" if equal else "the best"
@@ -171,6 +182,27 @@ def answer(summary: Summary, count: int) -> str:
     if own.unranked:
         first += f"; it leaves the limits or diverges in {own.unranked}"
     return f"{first}. {_distance(own)}"
+
+
+def conduct(own: Line, other: Line | None, unit: str) -> str:
+    """How a policy rests, moves r~ and keeps the limits, beside another one."""
+    names = [name for name in own.rows if other is None or name in other.rows]
+    said, rest = [], next((name for name in names if short(name) == "rest"), "")
+    swing = own.median(rest, "swing")
+    if swing is not None:
+        theirs = None if other is None else other.median(rest, "swing")
+        beside = "" if other is None or theirs is None else f" ({other.label}: {figure(theirs)})"
+        said.append(f"At rest its r̃ swings by {figure(swing)}{in_words(unit)}{beside}.")
+    outside = {name: own.median(name, "violation_time") or 0.0 for name in own.rows}
+    worst = max(outside, key=outside.__getitem__)
+    kept = f"is outside the limits in up to {figure(100 * outside[worst])} % of the steps ({short(worst)})"
+    kept = kept if outside[worst] else "never leaves the limits where it does not diverge"
+    if other is not None:
+        pairs = [(own.median(name, "r_tilde_tv"), other.median(name, "r_tilde_tv")) for name in names]
+        moved = [one / two for one, two in pairs if one and two]
+        if moved:
+            kept = f"moves r̃ {ratio(float(scipy.stats.gmean(moved)))} as much as {other.label}, and {kept}"
+    return " ".join([*said, f"It {kept}."])
 
 
 def _distance(line: LineSummary) -> str:
@@ -295,6 +327,9 @@ def write(path: Path, comparison: Comparison, figures: Mapping[str, Path], respo
     environment.filters |= {"figure": figure, "ratio": ratio, "short": short, "setting": setting}
     every = lines(comparison.rows, comparison.policies)
     names = scenarios(comparison.rows)
+    about, other = (
+        next((line for line in every if line.label == label), None) for label in leaders(comparison.statistics)
+    )
     known = {name: figures.get(name) for name in ("errors", "effort", "stability")}
     page = environment.get_template("report.html.j2").render(
         plant=comparison.plant,
@@ -308,6 +343,7 @@ def write(path: Path, comparison: Comparison, figures: Mapping[str, Path], respo
         kinds=KIND_NAMES,
         statistics=comparison.statistics,
         answer=answer(comparison.statistics, len(names)),
+        conduct=conduct(about, other, symbol(comparison.y_unit)) if about else "",
         limited=bool(comparison.statistics.scenarios),
         scenarios=names,
         lines=every,

@@ -26,6 +26,7 @@ from jaxouter.evaluation.results import (
     SweepErrors,
 )
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.statistics import Line
 from jaxouter.identification import steady_state
 from jaxouter.plants import make
 from jaxouter.tasks import Axis
@@ -199,6 +200,15 @@ def test_scenario_is_chosen_with_the_keyboard(page):
     assert overflow(page) == 0
 
 
+def test_a_click_on_a_scenario_shows_its_responses(page):
+    before = page.locator("#response").get_attribute("src")
+    page.locator("section#errors thead").get_by_role("link", name="steps").click()
+    assert page.get_by_label("Scenario", exact=True).locator("option:checked").inner_text() == "pitch/steps"
+    assert page.locator("#response").get_attribute("src") != before
+    assert page.locator("#responses-title").evaluate("title => title.getBoundingClientRect().top") < 200
+    assert overflow(page) == 0
+
+
 def test_hostile_names_stay_text(page):
     assert page.evaluate("document.scripts.length") == 1
     assert page.locator("section#errors th", has_text=HOSTILE).count() == 1
@@ -269,6 +279,30 @@ def line(kind, mean_rank, first, unranked=0, ratios=()):
 )
 def test_answer_in_every_case(lines, said):
     assert report.answer(Summary([], lines, {}), 4) == said
+
+
+def acted(label: str, **columns: tuple[float, ...]) -> Line:
+    """A line with these figures of merit on paper, steps and rest."""
+    merits = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    names = ("pitch/paper", "pitch/steps", "pitch/rest")
+    nothing = dict.fromkeys(FiguresOfMerit.__struct_fields__)
+    rows = {
+        name: [Row(label, None, None, name, None, None, True, None, **nothing | found)]
+        for name, found in zip(names, merits, strict=True)
+    }
+    return Line(label, label, None, "learned", rows)
+
+
+def test_the_headline_tells_of_rest_effort_and_limits():
+    own = acted("learned", swing=(9.0, 9.0, 0.004), r_tilde_tv=(20.0, 80.0, 10.0), violation_time=(0.0, 0.006, 0.001))
+    calm = acted("lq", swing=(9.0, 9.0, 0.002), r_tilde_tv=(10.0, 40.0, 5.0), violation_time=(0.0, 0.0, 0.0))
+    assert report.conduct(own, calm, "crad") == (
+        "At rest its r̃ swings by 0.00400 crad (lq: 0.00200). It moves r̃ 2.00× as much as lq, and is outside the limits "
+        "in up to 0.600 % of the steps (steps)."
+    )
+    assert report.conduct(calm, None, "1") == (
+        "At rest its r̃ swings by 0.00200. It never leaves the limits where it does not diverge."
+    )
 
 
 @pytest.mark.parametrize(
