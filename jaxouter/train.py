@@ -22,8 +22,9 @@ from jaxouter.evaluation.metrics import FiguresOfMerit, number
 from jaxouter.evaluation.policies import TrainingSummary
 from jaxouter.plants.base import in_words
 from jaxouter.plants.registry import add
-from jaxouter.progress import showing
+from jaxouter.progress import Progress, showing
 from jaxouter.tasks.presets import implied
+from jaxouter.terminal import console
 from jaxouter.training.config import TrainConfig, preset, to_dict
 from jaxouter.training.devices import Processes, is_first
 from jaxouter.training.epochs import NotFiniteError
@@ -85,7 +86,7 @@ def parse(arguments: list[str]) -> Options:
     plain = [argument for argument in arguments if argument not in ("-h", "--help")]
     given = tyro.cli(Options, prog=program, args=plain, default=first)
     config = given.config
-    with showing(config.plant not in plants.REGISTRY):
+    with Progress(console, config.plant not in plants.REGISTRY):  # JAX may have to find other processes first
         plant = add(config.plant, config.plant_options, cli.settings(given.set))
     name = implied(config.preset, config.base)
     default = Options(preset(plant, name, agent), agent=agent)

@@ -203,7 +203,7 @@ def test_a_run_on_a_plant_of_ones_own_names_it_again(tmp_path):
     arguments = [sys.executable, "-m", "jaxouter.export", str(run.path), "--format", "c"]
     unnamed = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
     assert (unnamed.returncode, unnamed.stdout) == (2, "")
-    assert "so name this plant on the command line" in unnamed.stderr
+    assert "so name the plant on the command line" in unnamed.stderr
     done = subprocess.run([*arguments, "--plant", TANKS], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, "")
     _, _, told, *_, found = done.stdout.splitlines()
