@@ -20,7 +20,8 @@ versions.warn()
 
 if TYPE_CHECKING:
     from jaxouter.agents import Agent
-    from jaxouter.api import Run, learn, load, make, resume
+    from jaxouter.api import Run, learn, load, resume
+    from jaxouter.loop.environment import make
     from jaxouter.loop.policy import Policy
     from jaxouter.plants import Plant
 
@@ -32,7 +33,7 @@ _MODULES = {
     "Run": "api",
     "learn": "api",
     "load": "api",
-    "make": "api",
+    "make": "loop.environment",
     "resume": "api",
 }
 __all__ = ["Agent", "Plant", "Policy", "Run", "__version__", "learn", "load", "make", "resume"]
@@ -42,6 +43,8 @@ def __getattr__(name: str) -> Any:
     """Import a name on first use, so that an exported controller does not import JAX."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "make":
+        importlib.import_module(f"{__name__}.identification")  # for plants log:FILE
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 

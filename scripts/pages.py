@@ -34,7 +34,7 @@ PRESETS = ("paper", "default")
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the figures as results/NAME.png, and the page of the commands."""
-    for path in sorted(RESULTS.glob("*.png")):
+    for path in sorted([*RESULTS.glob("*.png"), *RESULTS.glob("*.webp")]):
         files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
     files.append(File.generated(config, "reference/commands.md", content=commands()))
 
