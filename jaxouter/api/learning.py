@@ -450,7 +450,7 @@ def draw(
     levels = {name: value for name, value in maes.items() if value is not None}
     levels |= {"paper's DRL": selected[0].paper[1]} if selected[0].paper else {}
     rows = {seed: run.rows(seed) for seed in run.seeds}
-    title = f"{selected[0].id}, MAE" + in_words(selected[0].plant.y_unit, " [{}]")
+    title = f"{selected[0].id}, MAE" + in_words(figures.symbol(selected[0].plant.y_unit), " [{}]")
     if run.config.epochs:
         figures.keep(figures.learning_curve(rows, levels, title), run.figures / "learning-curve.png")
         drawn()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ INNER, LEARNED, REFERENCE, MODIFIED, LIMIT = "#8a8a8a", "#0b6fb8", "#111111", "#
 UNITS = {"degC": "°C"}
 HELD_OUT_ROWS = 600  # that are drawn
 LIVE_ROWS = 600  # the same, at either end
+FAR = 4.0  # levels above so many times the largest MAE are not drawn: the curves would be flat
 LETTER, HANDLE = 0.067, 0.62  # widths in a legend, inches
 LIMITS: dict[str, Any] = dict(color=LIMIT, ls=":", lw=1.2, label="limits of y, bounds of r̃")
 WIDE, NARROW = (dict[str, Any](color=LEARNED, alpha=alpha, lw=0) for alpha in (0.12, 0.25))
@@ -230,8 +232,12 @@ def learning_curve(rows: Mapping[int, Sequence[Mapping[str, Any]]], levels: Mapp
             rounds = [row["gain"] if row.get("kept") and "rate" in row else 0.0 for row in of_seed]
             gained = np.cumsum(rounds).tolist()
         right.plot(updates, gained, lw=1.6)
-    for (name, value), style in zip(levels.items(), ("-", "--", ":"), strict=False):
-        left.axhline(value, color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
+    high = FAR * max(row["mae"] for of_seed in rows.values() for row in of_seed)
+    for (name, value), style in zip(levels.items(), cycle(("-", "--", ":", "-.")), strict=False):
+        above = ", above" if value > high else ""
+        left.plot([], [], color=INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}{above}")
+        if not above:
+            left.axhline(value, color=INNER, ls=style, lw=1.2)
     left.set_ylabel("MAE without exploration")
     log_axis(left, "y")
     left.set_title(title, fontsize=10, loc="left")

@@ -80,6 +80,15 @@ def test_a_learning_curve_has_a_line_a_seed_and_the_levels(tmp_path):
     assert path.stat().st_size > 10_000
 
 
+def test_levels_far_above_the_curve_are_told_and_not_drawn():
+    rows = [{"updates": 600 * k, "mae": 0.5, "gain": 0.0, "kept": 0.0, "rate": 1.0} for k in range(1, 4)]
+    levels = {"none": 15.6, "static": 1.9, "lq": 0.56, "paper's DRL": 1.17}
+    figure = figures.learning_curve({0: rows}, levels, "MAE")
+    assert figure.axes[0].get_ylim()[1] < 2.2
+    labels = [text.get_text() for text in figure.legends[0].texts]
+    assert sorted(labels) == ["lq 0.56", "none 15.6, above", "paper's DRL 1.17", "seed 0", "static 1.9"]
+
+
 def test_a_learning_curve_of_pairs_shows_what_the_gate_let_through():
     kept = [{"updates": 600 * k, "mae": 2.6, "gain": 0.5, "kept": k % 2, "rate": 1.0} for k in range(1, 4)]
     check = {"updates": 1800, "mae": 2.6, "gain": 9.0, "kept": 1.0}
