@@ -114,5 +114,5 @@ def _text(
     which = "" if len(of_seeds) == 1 else f" by seed {', '.join(map(str, worse))}"
     return (
         f"verdict: {on} what was learned{which} is worse than {best}; MAE{unit}: learned {ours}, {others}. Use {best} "
-        "in its place, or train otherwise; export asks for --force"
+        "in its place, or train differently; export asks for --force"
     )
