@@ -102,7 +102,7 @@ def test_a_plant_that_diverges_is_held_first_and_what_is_given_stays(monkeypatch
     assert config.explored_steps == (EXPLORED + unstable.EPISODES) * kinds.EPISODE
     assert config.identification_steps == config.explored_steps + (8 + 2 * (64 + 128)) * kinds.EPISODE
     assert "identified: unstable alone; chosen: history 15" in (choice.said or "")
-    assert choose(replace(given, base="static")).warnings[0].endswith("which only training with --base lq can hold")
+    assert choose(replace(given, base="static")).warnings[0].endswith("train with --base lq, which holds it")
 
 
 def test_what_nothing_moves_is_refused_before_training(monkeypatch: pytest.MonkeyPatch) -> None:
