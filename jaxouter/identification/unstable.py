@@ -1,10 +1,11 @@
 """Identification of a plant that is unstable alone, from records that diverge.
 
 Episodes of random r~ count until y leaves the plant's bounds. A model of them gives an LQ law; under this law and a
-dither episodes last longer, and those that stay within the bounds are recorded too. Each episode is then continued by
-the model, as it would have been under a law without bounds, so that what came of its start under any other r~ can be
-computed (`counterfactual`). Starts that no r~ within the bounds can bring back are left out: a linear programme on the
-model says which.
+dither episodes last longer, and those that stay within the bounds are recorded too, in two rounds, the second under the
+law of all before. The law is the one that follows best from rest: laws that bring back more starts follow slowly, and
+starts far away are for the actor to learn. Each episode is then continued by the model, as it would have been under a
+law without bounds, so that what came of its start under any other r~ can be computed (`counterfactual`). Starts that no
+r~ within the bounds can bring back are left out: a linear programme on the model says which.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ NOISE = 6e-3  # standard deviation in the fit; 1 is half the set-point range
 PRICES = (*lq.PRICES, 10**2.5, 10.0**3)  # of moves: a law that moves r~ less is at its bounds less often
 INSIDE = 0.8  # share of the set-point range in closed loop
 DITHER, RATE = 1 / 12, 0.2  # of half the range of r~; redraws per control step
+ROUNDS = 2  # of episodes in closed loop, each under the law of all before
 LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 
 
@@ -88,19 +90,22 @@ def identify(
     Raises:
         ValueError: no recorded start can be brought back; says why.
     """
-    key_law, key_run = jax.random.split(key)
+    key_law, *keys = jax.random.split(key, 1 + ROUNDS)
     opened = within(data, plant.divergence_bounds, 0.0)
-    law, _ = _law(plant, opened, key_law, history, disturbances, static)
-    closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key_run, episodes))))
-    stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
-    # Starts that are hard to hold are among the others; more of them would outweigh how well y follows.
-    both = Record(
-        *(np.concatenate([one, two[stayed]]).astype(np.float64) for one, two in zip(opened, closed, strict=True))
-    )
-    law, replayed = _law(plant, both, key_law, history, disturbances, static)
+    law, replayed = _law(plant, opened, key_law, history, disturbances, static)
+    both = opened
+    for i, key_run in enumerate(keys):
+        ran = (episodes + i) // ROUNDS
+        closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key_run, ran))))
+        stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
+        # Starts that are hard to hold are among the others; more of them would outweigh how well y follows.
+        both = Record(
+            *(np.concatenate([one, two[stayed]]).astype(np.float64) for one, two in zip(both, closed, strict=True))
+        )
+        law, replayed = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
         f"{plant.name} is unstable alone; {len(replayed.y)} of {len(both.y)} recorded starts can be brought back, and "
-        f"{stayed.sum()} of {episodes} episodes under the LQ law stayed within bounds",
+        f"{len(both.y) - len(opened.y)} of {episodes} episodes under the LQ law stayed within bounds",
         IdentificationWarning,
         stacklevel=2,
     )
@@ -124,7 +129,8 @@ def _law(
     numbers = [np.repeat(each[None], alive.sum(), 0) for each in (model.a, model.b)]
     known = [each[alive] for each in (replayed.r_tilde, replayed.y, replayed.y)]
     params = CounterfactualParams(*(jnp.asarray(each, float) for each in (*numbers, *known)))
-    found = lq.choose(plant, [data], static, key, history, disturbances, models=[params], prices=PRICES)
+    from_rest = [resting(plant, model)]
+    found = lq.choose(plant, [data], static, key, history, disturbances, models=from_rest, prices=PRICES)
     if found.settings is None:
         raise ValueError(f"{about}; no linear law that was tried holds it")
     return found.law, params
@@ -137,6 +143,15 @@ def fit(plant: Plant, data: Record, n: int) -> Model:
     past = k[:, None] - np.arange(n)
     residual = data.y[:, k + 1] - data.y[:, past] @ a - data.r_tilde[:, past] @ b
     return Model(a, b, np.nanmean(residual), np.nanstd(residual))
+
+
+def resting(plant: Plant, model: Model) -> CounterfactualParams:
+    """An episode in which the model rests in the middle of the set-point range."""
+    middle, steps = sum(plant.setpoint_range) / 2, plant.episode_steps
+    r_tilde = (middle * (1.0 - model.a.sum()) - model.c) / model.b.sum()
+    y = np.full((1, steps + 1), middle)
+    episode = model.a[None], model.b[None], np.full((1, steps), r_tilde), y, y
+    return CounterfactualParams(*(jnp.asarray(each, float) for each in episode))
 
 
 def continued(plant: Plant, data: Record, model: Model) -> Record:

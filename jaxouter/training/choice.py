@@ -22,10 +22,10 @@ ON_HOST = 4  # episodes on which actors are compared, on a plant that is simulat
 
 UNSTABLE = {
     "correction": 1.0,  # the law is tuned to stay off the bounds of r~, so the actor gets the whole range
-    "disturbances.noise": 0.006,
+    "disturbances.noise": 0.0075,
     "disturbances.load": 0.0,
     "pretraining.closed_loop": 128,
-    "pretraining.gradient_steps": 1_200,
+    "pretraining.gradient_steps": 2_000,
     "pretraining.log_above": 1.0,
     "pairs.rounds": 0,
 }

@@ -63,6 +63,14 @@ def test_what_can_be_brought_back_is_what_the_bounds_of_r_tilde_allow(y0, back):
     assert unstable.can_be_brought_back(plant, replayed, impulse_response(model, kinds.EPISODE)).tolist() == [back]
 
 
+def test_laws_are_compared_from_rest_wherever_the_model_has_it():
+    plant, _ = kinds.kind([A], [B], setpoint_range=(2.0, 6.0), r_tilde_bounds=(-20.0, 20.0))()
+    model = Model(np.array([A, 0.0]), np.array([B, 0.0]), 0.3, 0.0)
+    rests = unstable.resting(plant, model)
+    np.testing.assert_allclose(rests.y, 4.0)
+    np.testing.assert_allclose(A * 4.0 + B * rests.r_tilde + 0.3, 4.0, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("dead", "least"), [(0, 15), (25, 30)])
 def test_as_many_lags_are_chosen_as_predict_well(dead, least):
     plant, params = kinds.kind([1.03], [0.04], dead)()
