@@ -13,6 +13,7 @@ from tests.load import ROOT, load
 
 docs = load("scripts", "docs")
 pages = load("scripts", "pages")
+published = load("scripts", "published")
 FROM_ELSEWHERE = re.compile(
     r"""<(?:script|link|img|iframe)[^>]*\b(?:src|href)="?(?:https?:)?//|url\(["']?https?:|@import"""
 )
@@ -60,6 +61,17 @@ def test_a_figure_that_is_not_there_ends_the_build():
     assert pages.figure("mae", "none", "pitch/paper") == "10.9"
     with pytest.raises(ValueError, match="there is no mae of magic on pitch/paper"):
         pages.figure("mae", "magic", "pitch/paper")
+
+
+def test_what_is_shown_is_there_and_has_a_command_that_makes_it():
+    shown = published.shown()
+    assert {"animation.webp", "compare-pitch.csv", "pitch-paper.json", "robust-pitch.md"} <= set(shown)
+    assert [name for name in shown if not (published.RESULTS / name).is_file()] == []
+    commands = {name: published.maker(name) for name in shown}
+    assert [name for name, command in commands.items() if command is None] == []
+    for path in re.findall(r"python ((?:benchmarks|scripts)/\w+\.py)", " ".join(map(str, commands.values()))):
+        assert (ROOT / path).is_file(), path
+    assert published.made("robust-pitch.md") == "2026-11-26"
 
 
 PAGE = """# Page
