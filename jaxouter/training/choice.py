@@ -25,7 +25,7 @@ UNSTABLE = {
     "disturbances.noise": 0.0075,
     "disturbances.load": 0.0,
     "pretraining.closed_loop": 128,
-    "pretraining.gradient_steps": 2_000,
+    "pretraining.gradient_steps": 1_500,
     "pretraining.log_above": 1.0,
     "pairs.rounds": 0,
 }
