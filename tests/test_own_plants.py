@@ -1,6 +1,10 @@
 """Plants of one's own through the commands: in a file, in recorded data, in Gymnasium."""
 
 import json
+import os
+import re
+import subprocess
+import sys
 from unittest.mock import patch
 
 import gymnasium
@@ -48,6 +52,28 @@ def test_a_loop_that_is_unstable_alone_is_held(tmp_path, monkeypatch, capsys):
     maes = {each["policy"]: each["scenarios"]["LongPipe/steps"]["mae"] for each in results}
     assert maes["none"] > 100.0
     assert maes["learned"] < 0.3
+
+
+WEAK = """
+from dataclasses import replace
+from tests import kinds
+
+def Weak():
+    plant, params = kinds.kind([1.2], [0.01], divergence_bounds=(-12.0, 12.0), setpoint_range=(-1.0, 1.0))()
+    return replace(plant, name="Weak", r_tilde_bounds=(-0.01, 0.01)), params
+"""
+
+
+@pytest.mark.slow
+def test_a_loop_that_nothing_can_hold_is_refused_with_the_reason_and_leaves_nothing(tmp_path):
+    (tmp_path / "weak.py").write_text(WEAK)
+    command = [sys.executable, "-m", "jaxouter.train", "weak.py:Weak"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert re.search(r"grows by 1\.2 in a control step, r~ acts after 1 and lies in \(-0\.01, 0\.01\)", done.stderr)
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir() if path.name != "__pycache__"] == ["weak.py"]
 
 
 @pytest.mark.slow
