@@ -136,15 +136,20 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, price: float) -> np.nda
         B: (n, 1).
         price: positive.
 
+    Where no input can keep the sum finite, P is nan.
+
     The structure-preserving doubling algorithm; tested against scipy.
     """
     G, P, one = B @ B.T / price, Q, np.eye(len(A))
-    for _ in range(DOUBLINGS):
-        AW, GW = np.hsplit(np.linalg.solve(one + G @ P, np.hstack([A, G])), 2)
-        more = A.T @ P @ AW
-        G, P, A = G + A @ GW @ A.T, P + more, A @ AW
-        if np.abs(more).max() <= 1e-12 * np.abs(P).max():
-            break
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(DOUBLINGS):
+            AW, GW = np.hsplit(np.linalg.solve(one + G @ P, np.hstack([A, G])), 2)
+            more = A.T @ P @ AW
+            G, P, A = G + A @ GW @ A.T, P + more, A @ AW
+            if not np.isfinite(P).all():
+                return np.full_like(P, np.nan)
+            if np.abs(more).max() <= 1e-12 * np.abs(P).max():
+                break
     return P
 
 

@@ -43,6 +43,8 @@ NOISE = 6e-3  # standard deviation in the fit; 1 is half the set-point range
 PRICES = (*lq.PRICES, 10**2.5, 10.0**3)  # of moves: a law that moves r~ less is at its bounds less often
 INSIDE = 0.8  # share of the set-point range in closed loop
 DITHER, RATE = 1 / 12, 0.2  # of half the range of r~; redraws per control step
+DISTURBANCES = Disturbances(noise=0.0075)  # under which laws are compared
+CLOSED = 128  # episodes in closed loop
 ROUNDS = 2  # of episodes in closed loop, each under the law of all before
 LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 
@@ -50,7 +52,7 @@ LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 class Identified(NamedTuple):
     """What the records gave."""
 
-    law: LinearLaw
+    chosen: lq.Choice
     params: CounterfactualParams  # of the model, on which each episode replays a recorded start
 
 
@@ -92,29 +94,29 @@ def identify(
     """
     key_law, *keys = jax.random.split(key, 1 + ROUNDS)
     opened = within(data, plant.divergence_bounds, 0.0)
-    law, replayed = _law(plant, opened, key_law, history, disturbances, static)
+    found = _law(plant, opened, key_law, history, disturbances, static)
     both = opened
     for i, key_run in enumerate(keys):
         ran = (episodes + i) // ROUNDS
-        closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key_run, ran))))
+        closed = Record(*map(np.asarray, _closed_loop(plant, params, found.chosen.law, jax.random.split(key_run, ran))))
         stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
         # Starts that are hard to hold are among the others; more of them would outweigh how well y follows.
         both = Record(
             *(np.concatenate([one, two[stayed]]).astype(np.float64) for one, two in zip(both, closed, strict=True))
         )
-        law, replayed = _law(plant, both, key_law, history, disturbances, static)
+        found = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
-        f"{plant.name} is unstable alone; {len(replayed.y)} of {len(both.y)} recorded starts can be brought back, and "
-        f"{len(both.y) - len(opened.y)} of {episodes} episodes under the LQ law stayed within bounds",
+        f"{plant.name} is unstable alone; {len(found.params.y)} of {len(both.y)} recorded starts can be brought back, "
+        f"and {len(both.y) - len(opened.y)} of {episodes} episodes under the LQ law stayed within bounds",
         IdentificationWarning,
         stacklevel=2,
     )
-    return Identified(law, replayed)
+    return found
 
 
 def _law(
     plant: Plant, data: Record, key: chex.PRNGKey, history: int, disturbances: Disturbances, static: LinearLaw
-) -> tuple[LinearLaw, CounterfactualParams]:
+) -> Identified:
     """The LQ law that suits the records best, and the episodes on their model that can be brought back."""
     model = fit(plant, data, history)
     replayed = continued(plant, data, model)
@@ -133,7 +135,7 @@ def _law(
     found = lq.choose(plant, [data], static, key, history, disturbances, models=from_rest, prices=PRICES)
     if found.settings is None:
         raise ValueError(f"{about}; no linear law that was tried holds it")
-    return found.law, params
+    return Identified(found, params)
 
 
 def fit(plant: Plant, data: Record, n: int) -> Model:

@@ -22,9 +22,9 @@ ON_HOST = 4  # episodes on which actors are compared, on a plant that is simulat
 
 UNSTABLE = {
     "correction": 1.0,  # the law is tuned to stay off the bounds of r~, so the actor gets the whole range
-    "disturbances.noise": 0.0075,
+    "disturbances.noise": unstable.DISTURBANCES.noise,
     "disturbances.load": 0.0,
-    "pretraining.closed_loop": 128,
+    "pretraining.closed_loop": unstable.CLOSED,
     "pretraining.gradient_steps": 1_500,
     "pretraining.log_above": 1.0,
     "pairs.rounds": 0,

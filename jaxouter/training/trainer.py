@@ -102,7 +102,11 @@ class Trainer:
         of_plant = self.config.base == "lq" or not plant.identified
         data = recorded(start, plant, params.plant, key_record, say) if self.config.records and of_plant else []
         found = self._unstable(params, data[0], key_base, say) if start.closed_loop else None
-        base = self._base(state.base, params, data, key_base, say) if found is None else found.law
+        base = (
+            self._base(state.base, params, data, key_base, say)
+            if found is None
+            else padded(found.chosen.law, self.env.observer.lags)
+        )
         state = state._replace(base=base)
         if not start.gradient_steps:
             return state
@@ -147,8 +151,7 @@ class Trainer:
         static = steady_state.static(plant, params.plant, key)[1]
         longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
         of_law = jax.random.fold_in(key, BASE), observer.history, self.config.disturbances, static
-        found = unstable.identify(longer, params.plant, data, *of_law, start.closed_loop)
-        return found._replace(law=padded(found.law, observer.lags))
+        return unstable.identify(longer, params.plant, data, *of_law, start.closed_loop)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:

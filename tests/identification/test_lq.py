@@ -87,6 +87,11 @@ def test_riccati_is_that_of_scipy():
     )
 
 
+def test_what_no_input_can_bring_back_has_no_law():
+    A, B, Q = np.diag([1.2, 0.5]), np.array([[0.0], [1.0]]), np.eye(2)
+    assert np.isnan(lq.riccati(A, B, Q, 1.0)).all()
+
+
 def test_noise_in_the_fit_is_that_of_many_noisy_copies():
     data, noise, rng = excited(*KNOWN["oscillating"]), 0.3, np.random.default_rng(1)
     copies = [(data.r_tilde, data.y + noise * rng.normal(size=data.y.shape)) for _ in range(400)]

@@ -86,8 +86,8 @@ def test_the_law_of_diverging_records_holds_the_plant(diverging):
     ys = []
     for _ in range(200):
         y = state.y[0]
-        carry = policy.init(found.law, jnp.asarray(0.5), y) if carry is None else carry
-        carry, r_tilde = policy.act(found.law, carry, jnp.asarray(0.5), y)
+        carry = policy.init(found.chosen.law, jnp.asarray(0.5), y) if carry is None else carry
+        carry, r_tilde = policy.act(found.chosen.law, carry, jnp.asarray(0.5), y)
         state = plant.step(params, state, r_tilde, kinds.key(0))
         ys.append(float(state.y[0]))
     assert np.abs(np.array(ys[100:]) - 0.5).max() < 0.02

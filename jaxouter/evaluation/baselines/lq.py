@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import chex
@@ -13,7 +14,7 @@ import numpy as np
 
 from jaxouter.evaluation.baselines.tuning import Report, learner
 from jaxouter.evaluation.cache import Tuned
-from jaxouter.identification import dynamics, steady_state
+from jaxouter.identification import dynamics, steady_state, unstable
 from jaxouter.identification.lq import Choice, Figure, choose, warn_short
 from jaxouter.identification.records import record, within
 from jaxouter.loop.policy import Linear, LinearLaw
@@ -30,8 +31,21 @@ def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: i
     _, static = steady_state.static(plant, params, key_static)
     data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("choosing its law", 0.5)
+    if plant.differentiable and dynamics.of_record(data).kind == "unstable":
+        return _of_unstable(plant, params, key, static, explored + data.r_tilde.size)
     found = choose(plant, [data], static, key_choose, history, learner(plant).disturbances, figure)
     return kept(found, explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size)
+
+
+def _of_unstable(plant: Plant, params: Any, key: chex.PRNGKey, static: LinearLaw, steps: int) -> Tuned:
+    """The law that a learned policy has as its base on a plant that is unstable alone, in `steps` steps more."""
+    key_lags, key_record, key_law = jax.random.split(key, 3)
+    longer = replace(plant, episode_steps=2 * plant.episode_steps)
+    history, data = unstable.lags(plant, params, key_lags), record(longer, params, key_record, RECORD)
+    of_law = key_law, history, unstable.DISTURBANCES, static, unstable.CLOSED
+    found = unstable.identify(longer, params, data, *of_law)
+    recorded = unstable.EPISODES * plant.episode_steps + (RECORD + unstable.CLOSED) * longer.episode_steps
+    return kept(found.chosen, steps + steady_state.LEVELS * plant.episode_steps + recorded)
 
 
 def kept(found: Choice, steps: int) -> Tuned:
