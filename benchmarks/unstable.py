@@ -88,7 +88,7 @@ def main(seeds: int = 5) -> None:
         rows.append([f"pitch/{case}", cell("mae"), cell("noisy"), f"{100 * could:.0f} %", cell("held", 100 / could)])
     columns = ["plant", "MAE from rest", f"with noise of {NOISE}", "starts that can be held", "of these held, %"]
     text = f"{table(columns, rows)}\n\nMedian (least to greatest) of {seeds} seeds. "
-    text += made("python benchmarks/unstable.py")
+    text += made(f"python benchmarks/unstable.py --seeds {seeds}")
     write_json(RESULTS / "unstable.json", {"machine": surroundings(), "plants": kept})
     (RESULTS / "unstable.md").write_text(text + "\n")
     print(text)
