@@ -210,6 +210,7 @@ def choose(
     on: Any = None,
     models: Sequence[CounterfactualParams] | None = None,
     prices: Sequence[float] = PRICES,
+    lags: Sequence[int] | None = None,
 ) -> Choice:
     """The best LQ law on held-out episodes of the records' own models.
 
@@ -231,9 +232,10 @@ def choose(
             None: on the record's own model.
         models: other episodes on which they are compared than the last quarter of the record.
         prices: of moves, to choose from.
+        lags: of the laws, to choose from; None: `lags_for` the plant.
     """
     whole = Record(*map(np.concatenate, zip(*data, strict=True)))
-    steps, wanted = whole.r_tilde.shape[1], lags_for(plant, history)
+    steps, wanted = whole.r_tilde.shape[1], lags_for(plant, history) if lags is None else list(lags)
     tried = [n for n in wanted if n < steps and len(whole.y) * (steps - n) >= 4 * n] or [1]
     most = max(tried) if tried != wanted else None
     if models is None:

@@ -131,8 +131,17 @@ def _law(
     numbers = [np.repeat(each[None], alive.sum(), 0) for each in (model.a, model.b)]
     known = [each[alive] for each in (replayed.r_tilde, replayed.y, replayed.y)]
     params = CounterfactualParams(*(jnp.asarray(each, float) for each in (*numbers, *known)))
-    from_rest = [resting(plant, model)]
-    found = lq.choose(plant, [data], static, key, history, disturbances, models=from_rest, prices=PRICES)
+    found = lq.choose(
+        plant,
+        [data],
+        static,
+        key,
+        history,
+        disturbances,
+        models=[resting(plant, model)],
+        prices=PRICES,
+        lags=[history],  # laws with more bring back fewer starts
+    )
     if found.settings is None:
         raise ValueError(f"{about}; no linear law that was tried holds it")
     return Identified(found, params)
