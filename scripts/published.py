@@ -50,6 +50,7 @@ MAKERS = (  # what a file's name begins with, the most special first, and what m
     ("tests", "bash scripts/test.sh --all"),
 )
 SHOWN = re.compile(r"results/([\w.-]+\.\w+)|\{\{ ([\w-]+\.md) \}\}")
+README_TABLE = "paper-cases"  # between comments of this name
 NUMBER = re.compile(r"\{\{ \w+ of \S+\s+on\s+(\w+)/\S+ \}\}")
 PAPER = re.compile(r"\{\{ results \}\}")
 
@@ -61,6 +62,7 @@ def shown() -> dict[str, list[str]]:
         text = path.read_text()
         names = {one or other for one, other in SHOWN.findall(text)}
         names |= {f"compare-{plant}.csv" for plant in NUMBER.findall(text)}
+        names |= {f"{README_TABLE}.md"} if f"<!-- {README_TABLE} -->" in text else set()
         if PAPER.search(text):
             names |= {f"{plant}-{preset}.json" for plant in ("pitch", "heaters") for preset in ("paper", "default")}
         for name in names:

@@ -71,7 +71,8 @@ def test_what_is_shown_is_there_and_has_a_command_that_makes_it():
     assert [name for name, command in commands.items() if command is None] == []
     for path in re.findall(r"python ((?:benchmarks|scripts)/\w+\.py)", " ".join(map(str, commands.values()))):
         assert (ROOT / path).is_file(), path
-    assert published.made("robust-pitch.md") == "2026-11-26"
+    assert "README.md" in shown["paper-cases.md"]
+    assert f"Made on {published.made('unstable.md')} on " in (published.RESULTS / "unstable.md").read_text()
 
 
 PAGE = """# Page

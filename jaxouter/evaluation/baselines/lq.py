@@ -32,13 +32,16 @@ def tune(figure: Figure, plant: Plant, params: Any, key: chex.PRNGKey, budget: i
     data = within(record(plant, params, key_record, RECORD), plant.divergence_bounds)
     report("choosing its law", 0.5)
     if plant.differentiable and dynamics.of_record(data).kind == "unstable":
-        return _of_unstable(plant, params, key, static, explored + data.r_tilde.size)
+        return _of_unstable(plant, params, key_choose, static, explored + data.r_tilde.size)
     found = choose(plant, [data], static, key_choose, history, learner(plant).disturbances, figure)
     return kept(found, explored + steady_state.LEVELS * plant.episode_steps + data.r_tilde.size)
 
 
 def _of_unstable(plant: Plant, params: Any, key: chex.PRNGKey, static: LinearLaw, steps: int) -> Tuned:
-    """The law that a learned policy has as its base on a plant that is unstable alone, in `steps` steps more."""
+    """The law that a learned policy has as its base on a plant that is unstable alone, chosen by the MAE.
+
+    `steps` of the plant were taken before, which count too.
+    """
     key_lags, key_record, key_law = jax.random.split(key, 3)
     longer = replace(plant, episode_steps=2 * plant.episode_steps)
     history, data = unstable.lags(plant, params, key_lags), record(longer, params, key_record, RECORD)
