@@ -156,7 +156,7 @@ def evaluated(options: Options, run: Run | None, progress: Progress) -> Results:
 
 def places(run: Run, results: Results) -> dict[str, str] | None:
     """Where the scenarios' plants lie among those of a training that drew its plants; None: it drew none."""
-    if not run.config.randomise:
+    if not run.config.ranges:
         return None
     return {name: scenarios.place(scenarios.get(name, 1), *run.drawn) for name in results}
 

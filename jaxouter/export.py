@@ -57,7 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(
         f"{spec.plant}, seed {run.seed}: r~ in [{low:g}, {high:g}]{in_words(spec.y_unit)} from r and y"
         f"{in_words(spec.y_unit, ' in {}')}, once every {spec.control_step:g} {spec.time_unit}; state: "
-        f"{spec.history} past y, {spec.history} past r~, integral"
+        f"{spec.remembered} past y, {spec.remembered} past r~, integral"
+        + (f", how well the models of {spec.laws} laws predict, which law acts" if spec.laws > 1 else "")
     )
     for path in files.written(out):
         print(f"written: {path} ({path.stat().st_size / 1000:.1f} kB)")

@@ -34,7 +34,12 @@ from jaxouter.training.run import RunFolder, add_agent
 PROCESSES = tuple(Processes.__dataclass_fields__)
 
 
-SIMPLE = {"none": "inner loop alone", "static": "static prefilter", "lq": "LQ law"}  # columns of the table
+SIMPLE = {
+    "none": "inner loop alone",
+    "static": "static prefilter",
+    "lq": "LQ law",
+    "bank": "bank of laws",
+}  # columns of the table
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,7 @@ def show(summary: TrainingSummary, config: TrainConfig) -> None:
     for each in summary.results:
         by_name.setdefault(each.policy, []).append(each.scenarios)
     papers = {name: scenarios.get(name, 1).paper for name in summary.episodes}
-    rows, of_paper, placed = [], any(papers.values()), bool(config.randomise)
+    rows, of_paper, placed = [], any(papers.values()), bool(config.ranges)
     for name, of_scenario in papers.items():
         of_seeds = [found[name] for found in by_name["learned"]]
         values = [figures.mae for figures in of_seeds if figures.mae is not None]

@@ -36,11 +36,16 @@ OFF_POLICY = dict(steps=400, environments=1, epoch=100)
 PRETRAINED = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8))
 DRAWN = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8, plants=4))
 PAIRED = dict(pairs=dict(rounds=1, states=64, kept=1, environments=2, horizon=5, updates=2, batch_size=8), compared=8)
+OF_TWO = (0.1, (("d1", 0.45), ("d2", 0.45))), (100.0, (("d1", 5.65), ("d2", 0.6)))
+BANKED = dict(history=10, bank=OF_TWO, environments=2) | dict(
+    pretraining=dict(gradient_steps=20, episodes=8, batch_size=8, closed_loop=8, lags=70, episode_steps=200)
+)
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": PAIRED | PRETRAINED,
     "scratch": PAIRED | OFF_POLICY,
     "record": PRETRAINED | dict(compared=8),
-    "robust": DRAWN,
+    "pitch-robust": BANKED,
+    "heaters-robust": DRAWN,
     "paper": OFF_POLICY,
 }
 AGENT = dict(hidden=(16, 16), batch_size=32, prefill=200, replay=400)
@@ -79,7 +84,8 @@ def made(plant: str, preset: str) -> jaxouter.Run:
     """Train a golden run, and keep what a later version must read."""
     of_agent: dict[str, Any] = {f"agent.{name}": value for name, value in AGENT.items()}
     out = path(plant, preset)
-    run = jaxouter.learn(plant, preset, out=out, progress=False, episodes=1, **SETTINGS[preset], **of_agent)
+    settings = (SETTINGS.get(out.name) or SETTINGS[preset]) | of_agent
+    run = jaxouter.learn(plant, preset, out=out, progress=False, episodes=1, **settings)
     shutil.rmtree(out / "figures", ignore_errors=True)
     for name in NOT_KEPT:
         (out / name).unlink(missing_ok=True)

@@ -34,6 +34,7 @@ from jaxouter.evaluation.policies import (
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.identification.dynamics import exploration
 from jaxouter.loop import rewards
+from jaxouter.loop.bank import Bank
 from jaxouter.loop.policy import Linear
 from jaxouter.plants import Plant, base, make, slug
 from jaxouter.plants.base import in_words
@@ -49,6 +50,7 @@ from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict, wi
 from jaxouter.training.devices import Fleet, Processes
 from jaxouter.training.environments import TrainState
 from jaxouter.training.epochs import NotFiniteError, Pace, Report, Row, train
+from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.resources import arithmetic, resources
 from jaxouter.training.run import FORMAT, RunFolder, add_agent, lock, write_json
@@ -248,8 +250,9 @@ def _trained(
     """Train with progress, to the end or until a signal."""
     config = run.config
     progress.print(f"{config.plant}, preset {config.preset}, seeds {', '.join(map(str, run.seeds))} -> {run.path}")
-    for name, low, high in config.randomise:
-        progress.print(f"{name} is drawn from {low:g} to {high:g}")
+    for name, low, high in config.ranges:
+        how = "of the plants of the bank is" if config.bank else "is drawn from"
+        progress.print(f"{name} {how} {low:g} to {high:g}")
     plant, _ = make(config.plant)
     if (changed := reward_changes(config, plant)) is not None:
         progress.print(f"trained on {changed}; `return` is reported with the paper's weights")
@@ -377,8 +380,11 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     seconds = sum(row["seconds"] for seed in run.seeds for row in run.rows(seed)) / config.side_by_side
     of_seeds = {seed: trainer.policy_params(state) for seed, state in finals.items()}
     simple = {name: baseline(name, plant) for name in SIMPLE}
-    law = of_seeds[config.seed].base
-    if np.any(law.y_past):
+    law, actor = of_seeds[config.seed].base, of_seeds[config.seed].actor
+    if isinstance(law, Bank):
+        idle = LearnedParams(jax.tree.map(np.zeros_like, actor), law)
+        simple["bank"] = NamedPolicy("bank", trainer.policy, idle, plant)
+    elif np.any(law.y_past):
         simple["lq"] = NamedPolicy("lq", Linear(trainer.env.plant.r_tilde_bounds), law, plant)
     identifiers, rollouts = scenarios.reported(plant), len(finals) + len(simple)
     if episodes is None:
@@ -405,7 +411,7 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     by_mae = sorted(learned, key=lambda seed: learned[seed][selected[0].id].figures.mae or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(config.seed), FRESH)
-    affine = {name: named.params for name, named in simple.items()}
+    linear = {name: named.params for name, named in simple.items() if name != "bank"}
     terms = [term.__name__ for term in trainer.env.plant.reward_terms]
     summary = TrainingSummary(
         format=FORMAT,
@@ -417,7 +423,7 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
         reward=TrainedReward(vars(config.reward), terms, vars(rewards.PAPER) | {"terms": 0.0}),
         places={scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected},
         episodes={scenario.id: len(scenario.r) for scenario in selected},
-        verdict=verdict.judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, affine),
+        verdict=verdict.judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, linear),
         results=[
             result("learned", results, seed=seed, trained_return=trained(results)) for seed, results in learned.items()
         ]

@@ -3,6 +3,7 @@
 At a held set-point the loop is a map z -> F(z) from one control step to the next. Its equilibrium is found by a
 semi-smooth Newton method, and the spectral radius of its Jacobian there decides: below 1 the loop returns to the
 equilibrium after every small upset, above 1 it does not. Noise of plant and sensor is off; all is in double precision.
+Where a policy switches between laws, the one that acts at the equilibrium goes on to act.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class _Given(NamedTuple):
     policy: Any
     plant: Any
     r: jax.Array
+    carry: Any = ()  # of the policy, for what is no variable in it
 
 
 class _State(NamedTuple):
@@ -72,6 +74,10 @@ class _Loop:
         """State at the start of an episode."""
         state = self.plant.init(jax.random.key(0), given.plant)
         return _State(state, self.policy.init(given.policy, given.r, self.plant.output(given.plant, state)))
+
+    def begun(self, given: _Given) -> Any:
+        """The carry of the policy after the first control step."""
+        return self.step(given, self.begin(given))[0].carry
 
     def step(self, given: _Given, state: _State, seed: int | jax.Array = 0) -> tuple[_State, jax.Array]:
         """One control step as in a roll-out: the state at t_(k+1), and r~_k."""
@@ -95,10 +101,17 @@ class _Loop:
         template = self.begin(given)
         variables, remembered = ravel_pytree(self._evolving(given, template))[1](z)
         plant_state = self.plant.settled(given.plant, template.plant, variables)
-        return _State(plant_state, with_float_leaves(None, template.carry, remembered))
+        return _State(plant_state, with_float_leaves(None, given.carry, remembered))
 
     def _evolving(self, given: _Given, state: _State) -> tuple[Any, list[jax.Array]]:
         return self.plant.variables(given.plant, state.plant), float_leaves(None, state.carry)
+
+
+class _Begin(NamedTuple):
+    """Where an equilibrium is sought from."""
+
+    z: Any  # (n,)
+    carry: Any  # of the policy
 
 
 class _Point(NamedTuple):
@@ -124,8 +137,8 @@ def _linearise(loop: _Loop, given: _Given, z: jax.Array) -> _Point:
 
 
 @partial(jax.jit, static_argnums=0)
-def _simulate(loop: _Loop, given: _Given) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """State z (n,) at the start and after `EPISODES`, and whether y stayed within the bounds of divergence."""
+def _simulate(loop: _Loop, given: _Given) -> tuple[_Begin, _Begin, jax.Array]:
+    """The start, the end after `EPISODES`, and whether y stayed within the bounds of divergence."""
     low, high = loop.plant.divergence_bounds
 
     def step(at: tuple[_State, jax.Array], _: Any) -> tuple[tuple[_State, jax.Array], None]:
@@ -135,7 +148,8 @@ def _simulate(loop: _Loop, given: _Given) -> tuple[jax.Array, jax.Array, jax.Arr
 
     begin = loop.begin(given)
     (end, bounded), _ = jax.lax.scan(step, (begin, jnp.array(True)), length=EPISODES * loop.plant.episode_steps)
-    return loop.flatten(given, begin), loop.flatten(given, end), bounded
+    first = _Begin(loop.flatten(given, begin), loop.begun(given))
+    return first, _Begin(loop.flatten(given, end), end.carry), bounded
 
 
 @partial(jax.jit, static_argnums=0)
@@ -171,10 +185,16 @@ def analyse(
     with jax.enable_x64(True):
         policy_params, params = jax.tree.map(_double, (policy_params, params))
         params = plant.noise_free(plant.smallest(params))
-        given = [_Given(policy_params, params, jnp.asarray(r, float)) for r in set_points]
-        if given and not _time_invariant(loop, given[0]):
+        loop_at = [_Given(policy_params, params, jnp.asarray(r, float)) for r in set_points]
+        if loop_at and not _time_invariant(loop, _held(loop, loop_at[0], loop.begun(loop_at[0]))):
             return [_nothing(r, "depends on a clock or on noise that is not declared") for r in set_points]
-        return [_analyse(loop, each) for each in given]
+        return [_analyse(loop, each) for each in loop_at]
+
+
+def _held(loop: _Loop, given: _Given, carry: Any) -> _Given:
+    """The same without switching, by the law that acts in this carry of the policy."""
+    without = getattr(loop.policy, "without_switching", lambda params: params)
+    return given._replace(policy=without(given.policy), carry=carry)
 
 
 def _nothing(set_point: Any, note: str) -> LocalStability:
@@ -207,20 +227,23 @@ def _time_invariant(loop: _Loop, given: _Given) -> bool:
 
 
 def _analyse(loop: _Loop, given: _Given) -> LocalStability:
-    def linearise(z: np.ndarray) -> _Point:
+    def linearise(given: _Given, z: np.ndarray) -> _Point:
         return jax.device_get(_linearise(loop, given, z))  # type: ignore[arg-type]
 
     low, high = loop.plant.r_tilde_bounds
     rest, end, bounded = jax.device_get(_simulate(loop, given))
-    found = (_equilibrium(linearise, z, _range(loop)) for z in ([end, rest] if bounded else [rest]))
-    point = next((point for point in found if point is not None), None)
-    if point is None:
+    for begin in [end, rest] if bounded else [rest]:
+        linearised = partial(linearise, _held(loop, given, begin.carry))
+        point = _equilibrium(linearised, begin.z, _range(loop))
+        if point is not None:
+            break
+    else:
         return _nothing(given.r, "no equilibrium found")
     radius, notes = spectral_radius(point.jacobian), []
     if min(point.r_tilde - low, high - point.r_tilde) <= NEAR * _range(loop):
         notes.append("r~ at its bound")
-    moves = NEAR * _range(loop) * _signs(len(rest))
-    sides = [linearise(point.z + move).jacobian for move in (*moves, *-moves)]
+    moves = NEAR * _range(loop) * _signs(len(point.z))
+    sides = [linearised(point.z + move).jacobian for move in (*moves, *-moves)]
     if any(_jumps(point.jacobian, side) for side in sides):
         radii = [spectral_radius(side) for side in sides]
         radius = max(radii)

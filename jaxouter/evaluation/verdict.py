@@ -14,6 +14,7 @@ from msgspec import Struct
 
 from jaxouter.evaluation.baselines.tuning import EPISODES, training_episodes
 from jaxouter.evaluation.rollout import outputs
+from jaxouter.loop.bank import Bank
 from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE, in_words
@@ -62,7 +63,9 @@ def judge(
         errors = np.asarray(_errors(plant, policy, count, params, strong, key), np.float64)
         return np.where(np.isfinite(errors), errors, np.inf)
 
-    errors = {name: of(LearnedParams(idle, affine)) for name, affine in simple.items()}
+    base = next(iter(learned.values())).base  # with a bank, laws of one, so that all share a compiled function
+    alike = {name: base.all_of(law) if isinstance(base, Bank) else law for name, law in simple.items()}
+    errors = {name: of(LearnedParams(idle, law)) for name, law in alike.items()}
     by = {seed: of(each) for seed, each in learned.items()}
     found = {name: float(each.mean()) for name, each in errors.items()}
     of_seeds = {seed: float(each.mean()) for seed, each in by.items()}

@@ -27,8 +27,7 @@ def prefix(spec: ControllerSpec) -> str:
 
 def header_and_source(spec: ControllerSpec, stem: str) -> tuple[str, str]:
     """Texts of the files `stem`.h and `stem`.c."""
-    widths = [3 + 2 * spec.history, *(len(bias) for bias in spec.biases)]
-    values = dict(spec=spec, name=prefix(spec), stem=stem, widths=widths)
+    values = dict(spec=spec, name=prefix(spec), stem=stem, widths=spec.widths)
     return render("controller.h.j2", **values), render("controller.c.j2", **values)
 
 

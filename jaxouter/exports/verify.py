@@ -81,7 +81,13 @@ def signals(spec: ControllerSpec, policy: LearnedPolicy, params: LearnedParams, 
     r, y = r.astype(np.float32), y.astype(np.float32)
     with jax.default_matmul_precision("highest"):
         memory, r_tilde = jax.device_get(_record(policy, params, jnp.asarray(r, float), jnp.asarray(y, float)))
-    return Signals(r, y, State(*jax.tree.map(np.float32, tuple(memory))), r_tilde)
+    *past, evidence = jax.tree.map(_single, tuple(memory))
+    return Signals(r, y, State.of(*past, *evidence), r_tilde)
+
+
+def _single(leaf: Any) -> Any:
+    """The leaf in single precision; whole numbers as they are."""
+    return np.asarray(leaf, np.float32 if np.issubdtype(np.asarray(leaf).dtype, np.floating) else np.int32)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -150,9 +156,9 @@ class OnnxController:
 
     def act(self, state: State, r: float, y: float) -> tuple[State, float]:
         """One control step."""
-        inputs = state._asdict() | {"r": r, "y": y}
-        outputs: Any = self._session.run(None, {name: np.asarray(x, np.float32) for name, x in inputs.items()})
-        return State(*outputs[1:]), outputs[0]
+        inputs = state.numbers | {"r": np.float32(r), "y": np.float32(y)}
+        outputs: Any = self._session.run(None, {name: np.asarray(x) for name, x in inputs.items()})
+        return State.of(*outputs[1:]), outputs[0]
 
 
 class StablehloController:
@@ -164,23 +170,27 @@ class StablehloController:
 
     def act(self, state: State, r: float, y: float) -> tuple[State, float]:
         """One control step."""
-        r_tilde, *after = jax.device_get(self._act(np.float32(r), np.float32(y), *state))
-        return State(*after), r_tilde
+        r_tilde, *after = jax.device_get(self._act(np.float32(r), np.float32(y), *state.numbers.values()))
+        return State.of(*after), r_tilde
 
 
 def _struct(spec: ControllerSpec) -> type[ctypes.Structure]:
     """The state of the C code."""
-    past = ctypes.c_float * spec.remembered
+    past, each = ctypes.c_float * spec.remembered, ctypes.c_float * spec.laws
+    evidence = [("mean_error", each), ("performance", each), ("active", ctypes.c_int)] if spec.laws > 1 else []
 
     class Struct(ctypes.Structure):
-        _fields_ = [("y_past", past), ("r_tilde_past", past), ("integral", ctypes.c_float)]
+        _fields_ = [("y_past", past), ("r_tilde_past", past), ("integral", ctypes.c_float), *evidence]
 
     return Struct
 
 
 def _fill(struct: Any, state: State) -> None:
-    struct.y_past[:], struct.r_tilde_past[:] = state.y_past.tolist(), state.r_tilde_past.tolist()
-    struct.integral = state.integral.item()
+    for name, value in state.numbers.items():
+        if np.ndim(value):
+            getattr(struct, name)[:] = value.tolist()
+        else:
+            setattr(struct, name, value.item())
 
 
 class CController:

@@ -98,12 +98,7 @@ def identify(
     both = opened
     for i, key_run in enumerate(keys):
         ran = (episodes + i) // ROUNDS
-        closed = Record(*map(np.asarray, _closed_loop(plant, params, found.chosen.law, jax.random.split(key_run, ran))))
-        stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
-        # Starts that are hard to hold are among the others; more of them would outweigh how well y follows.
-        both = Record(
-            *(np.concatenate([one, two[stayed]]).astype(np.float64) for one, two in zip(both, closed, strict=True))
-        )
+        both = joined(both, in_closed_loop(plant, params, found.chosen.law, key_run, ran))
         found = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
         f"{plant.name} is unstable alone; {len(found.params.y)} of {len(both.y)} recorded starts can be brought back, "
@@ -112,6 +107,29 @@ def identify(
         stacklevel=2,
     )
     return found
+
+
+def in_closed_loop(
+    plant: Plant, params: Any, law: LinearLaw, key: chex.PRNGKey, episodes: int, at_rest: int = 0
+) -> Record:
+    """Episodes under a law and a dither; those that leave the plant's bounds are left out.
+
+    Starts that are hard to hold are among those under random r~; more of them would outweigh how well y follows.
+
+    Args:
+        plant, params, law, key: the loop; all random numbers.
+        episodes: to run.
+        at_rest: of these, how many begin at rest; the others begin as in training.
+    """
+    begins_at_rest = jnp.arange(episodes) < at_rest
+    closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key, episodes), begins_at_rest)))
+    stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
+    return Record(*(each[stayed] for each in closed))
+
+
+def joined(one: Record, two: Record) -> Record:
+    """The episodes of two records."""
+    return Record(*(np.concatenate(each).astype(np.float64) for each in zip(one, two, strict=True)))
 
 
 def _law(
@@ -257,18 +275,21 @@ class WithDither:
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-def _closed_loop(plant: Plant, params: Any, law: LinearLaw, keys: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+def _closed_loop(
+    plant: Plant, params: Any, law: LinearLaw, keys: chex.PRNGKey, at_rest: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """r~ (episodes, T) and y (episodes, T + 1) under a law and a dither, with set-points over most of the range."""
     policy, steps = WithDither(Linear(plant.r_tilde_bounds)), plant.episode_steps
     size = DITHER * np.ptp(plant.r_tilde_bounds) / 2
     low, high = plant.setpoint_range
     edge = (1.0 - INSIDE) / 2 * (high - low)
 
-    def episode(key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+    def episode(key: chex.PRNGKey, at_rest: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_r, key_dither, key_start, key_run = jax.random.split(key, 4)
         r = redrawn(key_r, steps, low + edge, high - edge)
         dithered = Dithered(law, telegraph(key_dither, steps, -size, size, RATE))
-        begun = closed_loop.begin(plant, params, plant.training_start(key_start, params))
+        starts = plant.init(key_start, params), plant.training_start(key_start, params)
+        begun = closed_loop.begin(plant, params, jax.tree.map(partial(jnp.where, at_rest), *starts))
 
         def step(carry: Any, x: Any) -> Any:
             state, memory = carry
@@ -281,4 +302,4 @@ def _closed_loop(plant: Plant, params: Any, law: LinearLaw, keys: chex.PRNGKey) 
         _, (r_tilde, y) = jax.lax.scan(step, begin, (r, jax.random.split(key_run, steps)))
         return r_tilde, jnp.concatenate([begun.y[None], y])
 
-    return jax.vmap(episode)(keys)
+    return jax.vmap(episode)(keys, at_rest)

@@ -7,7 +7,7 @@ of them, so what is not in `Signals` cannot reach the agent or the critic.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -25,6 +25,7 @@ class Memory(NamedTuple):
     y_past: jax.Array  # (M,), y_(k-1), y_(k-2), ...; M >= H
     r_tilde_past: jax.Array  # (M,), r~_(k-1), r~_(k-2), ...
     integral: jax.Array  # leaky integral of r - y, a running mean over `integral_time`
+    evidence: Any = ()  # of a bank of base laws, see `jaxouter.loop.bank`
 
 
 class Signals(NamedTuple):
@@ -52,6 +53,8 @@ class Observer:
     r_tilde_bounds: tuple[float, float]
     lags: int = 0
     """Past samples that the base law needs in the memory."""
+    laws: int = 0
+    """Laws in the bank of base laws, of which the observation shows which one acts; 0: there is no bank."""
 
     @classmethod
     def of(
@@ -83,7 +86,7 @@ class Observer:
     @property
     def size(self) -> int:
         """Length of the observation."""
-        return 3 + 2 * self.history
+        return 3 + 2 * self.history + self.laws
 
     def init(self, r0: jax.Array, y0: jax.Array) -> Memory:
         """Memory before t_0: histories filled with y_0 and r~_(-1), which is y_0 clipped to the bounds of r~."""
@@ -91,22 +94,24 @@ class Observer:
         return Memory(*Past.of(y0, self.remembered, self.r_tilde_bounds), jnp.zeros_like(y0))
 
     def observe(self, memory: Memory, r: jax.Array, y: jax.Array) -> tuple[Memory, jax.Array]:
-        """At t_k: memory with r_k - y_k integrated, and the observation (3 + 2H,)."""
+        """At t_k: memory with r_k - y_k integrated, and the observation (n,)."""
         memory = memory._replace(integral=memory.integral + (r - y - memory.integral) / self.integral_steps)
         return memory, self.features(memory, r, y)
 
     def record(self, memory: Memory, y: jax.Array, r_tilde: jax.Array) -> Memory:
         """After r~_k is chosen: y_k and r~_k enter the past."""
-        return Memory(*Past(memory.y_past, memory.r_tilde_past).then(y, r_tilde), memory.integral)
+        past = Past(memory.y_past, memory.r_tilde_past).then(y, r_tilde)
+        return memory._replace(**past._asdict())
 
     def features(self, memory: Memory, r: jax.Array, y: jax.Array) -> jax.Array:
-        """[r, r - y, leaky integral, past y minus y, past r~], scaled; (3 + 2H,)."""
+        """[r, r - y, leaky integral, past y minus y, past r~], scaled, and which law acts, if there is a bank; (n,)."""
         chex.assert_rank([r, y], 0)
         low, high = self.r_tilde_bounds
         present = jnp.stack([r - self.y_middle, r - y, memory.integral]) / self.y_scale
         y_past = (memory.y_past[: self.history] - y) / self.y_scale
         r_tilde_past = (memory.r_tilde_past[: self.history] - (low + high) / 2) / ((high - low) / 2)
-        return jnp.concatenate([present, y_past, r_tilde_past])
+        which = [jax.nn.one_hot(memory.evidence.active, self.laws, dtype=present.dtype)] if self.laws else []
+        return jnp.concatenate([present, y_past, r_tilde_past, *which])
 
     def memory_at(self, window: Signals, i: jax.Array | int) -> Memory:
         """The newest H of the memory at t_i (its error integrated), from a window that starts H steps earlier or more.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial, wraps
 from typing import Any
@@ -195,12 +195,25 @@ def _drawing(plant: Plant, drawn: tuple[tuple[int, tuple[int, ...], float, float
     """The plant that draws these elements of these leaves; cached, so that it is compiled once."""
 
     def draw(key: chex.PRNGKey, params: Any) -> Any:
-        leaves, structure = jax.tree.flatten(params)
-        for share, (leaf, element, low, high) in zip(jax.random.uniform(key, (len(drawn),), float), drawn, strict=True):
-            leaves[leaf] = leaves[leaf].at[element].set(low + (high - low) * share)
-        return jax.tree.unflatten(structure, leaves)
+        shares = jax.random.uniform(key, (len(drawn),), float)
+        values = [low + (high - low) * share for share, (_, _, low, high) in zip(shares, drawn, strict=True)]
+        return _with(params, [(*each[:2], value) for each, value in zip(drawn, values, strict=True)])
 
     return replace(plant, draw=draw)
+
+
+def with_numbers(params: Any, values: Mapping[str, float]) -> Any:
+    """Parameters of a plant with other numbers, such as `W[1]`, by names that `numbers` knows."""
+    known = numbers(params)
+    return _with(params, [(*known[name], value) for name, value in values.items()])
+
+
+def _with(params: Any, values: Sequence[tuple[int, tuple[int, ...], Any]]) -> Any:
+    """The parameters with these elements of these leaves."""
+    leaves, structure = jax.tree.flatten(params)
+    for leaf, element, value in values:
+        leaves[leaf] = leaves[leaf].at[element].set(value)
+    return jax.tree.unflatten(structure, leaves)
 
 
 @partial(jax.jit, static_argnums=0)

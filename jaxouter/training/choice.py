@@ -47,7 +47,7 @@ def choose(config: TrainConfig) -> Choice:
     Raises:
         ValueError: no r~ moves the output.
     """
-    if config.plant in tasks.TASKS:
+    if config.plant in tasks.TASKS or config.base == "bank":
         return Choice(config, None, ())
     plant, params = plants.make(config.plant)
     if plant.identified:

@@ -14,6 +14,7 @@ import tyro
 from jaxouter import agents, plants, tasks
 from jaxouter.agents import AgentConfig
 from jaxouter.agents.pairs import SHARES, PairsConfig
+from jaxouter.identification.bank import Member, ranges
 from jaxouter.identification.steady_state import LEVELS
 from jaxouter.loop.disturbances import Disturbances
 from jaxouter.loop.rewards import RewardConfig
@@ -21,7 +22,8 @@ from jaxouter.plants import declaration
 from jaxouter.plants.simulators import PlantOptions
 
 INTERNAL = ("plant", "preset", "explored_steps", "plant_options")  # fields that are no options by name
-Base = Literal["lq", "static", "none", "absolute"]
+Base = Literal["lq", "static", "none", "absolute", "bank"]
+MOST_LAWS = 12  # in a bank
 HUGE = 2**31  # numbers of a configuration must be smaller
 
 
@@ -96,7 +98,10 @@ class TrainConfig:
     """Parameters of the plant drawn for each episode: name, least, greatest value, repeated for each."""
     base: Base = "lq"
     """Base law, which the actor corrects: lq (linear-quadratic law of a record), static (inverse of the DC gain), none
-    (r~ = r) or absolute (the middle of the range of r~)."""
+    (r~ = r), absolute (the middle of the range of r~), or bank (an LQ law for each of several plants, chosen by what
+    their models predict; for pretraining alone)."""
+    bank: Annotated[tuple[Member, ...], tyro.conf.Suppress] = ()
+    """Plants of the base law bank, set by a preset or in Python; see `jaxouter.identification.bank.Member`."""
     correction: float = 1.0
     """Largest correction of the base law; 1 is half the range of r~."""
     reward_scale: float = 1.0
@@ -138,11 +143,12 @@ class TrainConfig:
         self.agent.check()
         if (self.pretraining.plants > 1) and not self.randomise:
             raise ValueError(f"pretraining.plants is {self.pretraining.plants}; without randomise it must be 1")
-        if self.pretraining.closed_loop and (self.randomise or self.base != "lq"):
+        if self.pretraining.closed_loop and (self.randomise or self.base not in ("lq", "bank")):
             raise ValueError(
-                f"pretraining.closed_loop is {self.pretraining.closed_loop}; it must be 0 without --base lq, and with "
-                "--randomise"
+                f"pretraining.closed_loop is {self.pretraining.closed_loop}; it must be 0 without --base lq or bank, "
+                "and with --randomise"
             )
+        self._check_bank()
         if self.pretraining.episodes % self.pretraining.plants:
             raise ValueError(
                 f"pretraining.episodes is {self.pretraining.episodes}; it must be a multiple of the "
@@ -173,6 +179,29 @@ class TrainConfig:
         if not (low == high == 0 or 0 < low <= high):
             raise ValueError(f"redraws is {self.redraws}; it must be 0 0, or two positive numbers in ascending order")
         return self
+
+    def _check_bank(self) -> None:
+        """Check that a bank is all that is learned on."""
+        if bool(self.bank) != (self.base == "bank"):
+            raise ValueError(
+                f"base is {self.base} and bank has {len(self.bank)} plants; a bank needs --base bank, and plants "
+                "that a preset or Python sets"
+            )
+        if not self.bank:
+            return
+        if not 2 <= len(self.bank) <= MOST_LAWS:
+            raise ValueError(f"bank has {len(self.bank)} plants; it must have 2 to {MOST_LAWS}")
+        if self.randomise:
+            raise ValueError("randomise must be empty with --base bank, which has plants of its own")
+        for name, value in (("steps", self.steps), ("pairs.rounds", self.pairs.rounds), ("compared", self.compared)):
+            if value:
+                raise ValueError(f"{name} is {value}; it must be 0 with --base bank, which is for pretraining alone")
+        ranges(plants.make(self.plant)[1], self.bank)
+
+    @property
+    def ranges(self) -> plants.Ranges:
+        """Parameters of the plants of the training: name, least and greatest value."""
+        return ranges(plants.make(self.plant)[1], self.bank) if self.bank else self.randomise
 
     @property
     def side_by_side(self) -> int:
@@ -224,13 +253,14 @@ class TrainConfig:
             return 0
         episodes = start.episodes + start.closed_loop
         recorded = episodes * (start.episode_steps or plant.episode_steps) if self.records else 0
+        recorded *= len(self.bank) or 1
         levels = LEVELS * plant.episode_steps if self.base in ("static", "lq") else 0
         return self.explored_steps + recorded + levels
 
     @property
     def records(self) -> bool:
         """Whether episodes are recorded, for the base law or for pretraining."""
-        return self.base == "lq" or self.pretraining.gradient_steps > 0
+        return self.base in ("lq", "bank") or self.pretraining.gradient_steps > 0
 
     @property
     def environment_steps(self) -> int:

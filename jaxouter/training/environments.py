@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxouter.agents import Agent
+from jaxouter.loop import bank
+from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Signals
-from jaxouter.loop.policy import LinearLaw, affine
+from jaxouter.loop.policy import affine
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
 
 AXIS = "environments"  # mesh axis of a learner's shards
@@ -27,7 +29,7 @@ class TrainState(NamedTuple):
     env: EnvState  # (E, ...)
     obs: jax.Array  # (E, n)
     noise: Any  # (E, ...), state of the exploration noise
-    base: LinearLaw  # base law of the policy
+    base: BaseLaw  # base law of the policy
     key: chex.PRNGKey
     steps: jax.Array  # int32, environment steps of the agent so far
     pairs: Any = ()  # of the rounds of pairs
@@ -36,7 +38,7 @@ class TrainState(NamedTuple):
 def step_with(
     env: Environment,
     policy: LearnedPolicy,
-    base: LinearLaw,
+    base: BaseLaw,
     params: EnvParams,
     state: EnvState,
     action: jax.Array,
@@ -88,7 +90,6 @@ class Environments:
     def fresh(self, key: chex.PRNGKey, params: EnvParams, data: Any) -> TrainState:
         """Random networks, reset environments; a zero action is the middle of the range of r~."""
         key, key_agent, key_env = jax.random.split(key, 3)
-        low, high = self.env.plant.r_tilde_bounds
         obs, env = jax.vmap(self.env.reset, (0, None))(jax.random.split(key_env, self.count), params)
         return TrainState(
             agent=self.agent.init(key_agent),
@@ -96,10 +97,19 @@ class Environments:
             env=env,
             obs=obs,
             noise=self.agent.noise(self.count),
-            base=affine(0.0, (low + high) / 2, self.env.observer.lags),
+            base=self._middle(),
             key=key,
             steps=jnp.zeros((), jnp.int32),
         )
+
+    def _middle(self) -> BaseLaw:
+        """The base law whose r~ is the middle of its range, or a bank of it."""
+        observer = self.policy.observer
+        middle = affine(0.0, sum(observer.r_tilde_bounds) / 2, observer.lags)
+        if not observer.laws:
+            return middle
+        nothing = jnp.zeros((observer.laws, observer.lags))
+        return bank.of([middle] * observer.laws, nothing, nothing, observer.y_scale)
 
     def policy_params(self, state: TrainState) -> LearnedParams:
         """The current parameters of the policy."""

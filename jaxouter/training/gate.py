@@ -13,8 +13,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import Environment, EnvParams
-from jaxouter.loop.policy import LinearLaw
 from jaxouter.training.environments import step_with
 from jaxouter.training.policy import LearnedPolicy
 
@@ -37,7 +37,7 @@ class Comparison(NamedTuple):
 
 
 def reward_of(
-    env: Environment, policy: LearnedPolicy, actor: Any, base: LinearLaw, params: EnvParams, key: chex.PRNGKey
+    env: Environment, policy: LearnedPolicy, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array]:
     """Mean reward per step of one fresh training episode without exploration, and its stratum (int).
 
@@ -69,7 +69,7 @@ def compare(
     policy: LearnedPolicy,
     incumbent: Any,
     candidates: Any,
-    base: LinearLaw,
+    base: BaseLaw,
     params: EnvParams,
     key: chex.PRNGKey,
     episodes: int,

@@ -13,8 +13,8 @@ import optax
 from jaxouter.agents import Agent
 from jaxouter.agents.noise import ornstein_uhlenbeck
 from jaxouter.agents.pairs import SHARES, Pairs, PairsLearner, PairsState
+from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
-from jaxouter.loop.policy import LinearLaw
 from jaxouter.loop.references import Still
 from jaxouter.training.environments import step_with
 from jaxouter.training.gate import Comparison, compare
@@ -41,7 +41,7 @@ class Improvement:
         return self.learner.init(key, actor)
 
     def round(
-        self, state: PairsState, actor: Any, base: LinearLaw, params: EnvParams, key: chex.PRNGKey
+        self, state: PairsState, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey
     ) -> tuple[PairsState, Any, dict[str, jax.Array]]:
         """One round.
 
@@ -65,7 +65,7 @@ class Improvement:
         return state._replace(rate=rate), actor, metrics | Comparison(*best_of_all)._asdict()
 
     def check(
-        self, actor: Any, base: LinearLaw, params: EnvParams, key: chex.PRNGKey
+        self, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey
     ) -> tuple[Any, dict[str, jax.Array]]:
         """The actor if it is better than none by more than the error, else one whose action is zero: the base law.
 
@@ -80,7 +80,7 @@ class Improvement:
         actor = jax.tree.map(lambda old, new: jnp.where(kept, old, new), actor, nothing)
         return actor, {"kept": jnp.where(kept, 1.0, 0.0), **found._asdict()}
 
-    def pairs(self, actor: Any, base: LinearLaw, params: EnvParams, key: chex.PRNGKey) -> Pairs:
+    def pairs(self, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey) -> Pairs:
         """Pairs at random states of episodes with exploration."""
         config, env = self.learner.config, self.env
         key_run, key_pick, key_size, key_sign, key_pairs = jax.random.split(key, 5)
@@ -96,7 +96,7 @@ class Improvement:
         return jax.vmap(lambda *given: self.pair(actor, base, params, *given))(states, change, keys)
 
     def pair(
-        self, actor: Any, base: LinearLaw, params: EnvParams, state: EnvState, change: jax.Array, key: chex.PRNGKey
+        self, actor: Any, base: BaseLaw, params: EnvParams, state: EnvState, change: jax.Array, key: chex.PRNGKey
     ) -> Pairs:
         """The pair of a state: r is held, and all but the first action's change is equal."""
         env, gamma = replace(self.env, goal=Still()), self.agent.data.discount
@@ -118,7 +118,7 @@ class Improvement:
         return Pairs(obs, self.policy.action(actor, obs), change, with_change - without)
 
     def _visit(
-        self, actor: Any, base: LinearLaw, params: EnvParams, sigma: jax.Array, key: chex.PRNGKey
+        self, actor: Any, base: BaseLaw, params: EnvParams, sigma: jax.Array, key: chex.PRNGKey
     ) -> tuple[EnvState, jax.Array]:
         """The states of an episode with exploration, and whether y had not diverged before; (T, ...)."""
         key_reset, key_noise, key_run = jax.random.split(key, 3)

@@ -14,6 +14,7 @@ from jaxouter.agents.agent import OffPolicy, OffPolicyAgent, Transitions
 from jaxouter.agents.replay import Replay, ReplayState
 from jaxouter.agents.returns import n_step_return
 from jaxouter.loop import rewards
+from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import EnvParams
 from jaxouter.loop.observation import Signals
 from jaxouter.loop.policy import LinearLaw
@@ -37,12 +38,13 @@ class Windows:
     plant: Plant
     reward_scale: float
 
-    def batch(self, replay: ReplayState, base: LinearLaw, price: RewardParams, bits: jax.Array) -> Transitions:
+    def batch(self, replay: ReplayState, base: BaseLaw, price: RewardParams, bits: jax.Array) -> Transitions:
         """Transitions chosen by random bits (B, `data.bits`), uint32; `base` and `price` serve those that are held."""
         windows, _ = self.replay.sample(replay, bits)
         return jax.vmap(lambda rows, bits: self._transition(rows, bits, base, price))(windows, bits)
 
-    def _transition(self, rows: jax.Array, bits: jax.Array, base: LinearLaw, price: RewardParams) -> Transitions:
+    def _transition(self, rows: jax.Array, bits: jax.Array, base: BaseLaw, price: RewardParams) -> Transitions:
+        assert isinstance(base, LinearLaw)  # a bank is for pretraining alone
         field = dict(zip(FIELDS, rows.T, strict=True))
         first, observer = self.replay.lead, self.policy.observer
         window = Signals(*(field[name] for name in Signals._fields))

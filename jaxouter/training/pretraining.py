@@ -26,8 +26,8 @@ from jax.sharding import PartitionSpec as P
 from jaxouter.agents.whitening import Whitening
 from jaxouter.identification import counterfactual, records
 from jaxouter.identification.records import Record
+from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.episodes import TrainingEpisodes
-from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import Plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import PretrainingConfig
@@ -100,13 +100,13 @@ class DifferentiableRollout:
         return jnp.mean(self.episodes.run(self.policy, params, plant_params, key).reward / self.plant.error_scale)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
-    def whitening(self, base: LinearLaw, plant_params: Any, key: chex.PRNGKey) -> Whitening:
+    def whitening(self, base: BaseLaw, plant_params: Any, key: chex.PRNGKey) -> Whitening:
         """Whitening of the observations under a zero action."""
         zero = jax.tree.map(jnp.zeros_like, self.policy.init_actor(key))
 
         def observed(key: chex.PRNGKey) -> jax.Array:
             seen = self.episodes.run(self.policy, LearnedParams(zero, base), plant_params, key)
-            return jax.vmap(lambda memory, r, y: self.policy.observer.observe(memory, r, y)[1])(
+            return jax.vmap(lambda memory, r, y: self.policy.observe(base, memory, r, y)[1])(
                 seen.memory, seen.r, seen.y_seen
             )
 
@@ -115,7 +115,13 @@ class DifferentiableRollout:
 
     @partial(jax.jit, static_argnums=0)
     def train(
-        self, carry: Any, white: Whitening, base: LinearLaw, plant_params: Any, rates: jax.Array, key: chex.PRNGKey
+        self,
+        carry: Any,
+        white: Whitening,
+        base: BaseLaw,
+        plant_params: Any,
+        rates: jax.Array,
+        key: chex.PRNGKey,
     ) -> tuple[Any, jax.Array]:
         """Gradient steps with the given rates (n,), each on fresh episodes.
 

@@ -48,14 +48,18 @@ def resources(config: TrainConfig) -> Resources:
         ValueError: the configuration is inconsistent.
     """
     trainer, params = build(config)
-    observer, start = trainer.env.observer, config.pretraining
+    observer, start = trainer.policy.observer, config.pretraining
     state = jax.eval_shape(trainer.fresh, jax.random.key(0), params)
+    of_bank = f", which of {observer.laws} laws acts" if observer.laws else ""
     widths = " - ".join(map(str, (observer.size, *config.agent.hidden, 1)))
     parts = {"agent": _size(state.agent), "data": _size((state.data, state.pairs))}
     parts |= {"environments": _size((state.env, state.obs, state.noise))}
     whole = _size(state)
     lines = [
-        ("observation", f"{observer.size} numbers: r, r - y, integral, {observer.history} past y, as many past r~"),
+        (
+            "observation",
+            f"{observer.size} numbers: r, r - y, integral, {observer.history} past y, as many past r~{of_bank}",
+        ),
         ("actor", f"{widths}, {_count(jax.eval_shape(trainer.agent.actor, state.agent)):,} parameters"),
         ("agent", f"{_count(state.agent):,} numbers: networks, targets, optimisers"),
     ]

@@ -150,7 +150,7 @@ class RunFolder:
     def drawn(self) -> tuple[str, Ranges, float]:
         """The plant of the training, ranges of its parameters, and the largest standard deviation of sensor noise."""
         noise = self.config.disturbances.noise * self.trainer[0].env.observer.y_scale
-        return self.config.plant, self.config.randomise, noise
+        return self.config.plant, self.config.ranges, noise
 
     @cached_property
     def fleet(self) -> Fleet:

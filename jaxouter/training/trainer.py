@@ -19,14 +19,15 @@ from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.pairs import PairsLearner
 from jaxouter.agents.replay import Replay
-from jaxouter.identification import counterfactual, lq, steady_state, unstable
+from jaxouter.identification import bank, counterfactual, lq, steady_state, unstable
+from jaxouter.identification.bank import Identified
 from jaxouter.identification.records import Record, within
-from jaxouter.identification.unstable import Identified
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw, none, padded
 from jaxouter.loop.references import Family, SetPoint
+from jaxouter.plants import Plant
 from jaxouter.plants import make as make_plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
@@ -100,13 +101,13 @@ class Trainer:
         plant, start = self.env.plant, self.config.pretraining
         key_record, *keys = jax.random.split(jax.random.fold_in(key_base, PRETRAINING), 3)
         of_plant = self.config.base == "lq" or not plant.identified
-        data = recorded(start, plant, params.plant, key_record, say) if self.config.records and of_plant else []
-        found = self._unstable(params, data[0], key_base, say) if start.closed_loop else None
-        base = (
-            self._base(state.base, params, data, key_base, say)
-            if found is None
-            else padded(found.chosen.law, self.env.observer.lags)
-        )
+        data, found = [], None  # model and base law of what is not identified as `default` is
+        if self.config.base == "bank":
+            found = self._bank(params, key_record, say)
+        elif self.config.records and of_plant:
+            data = recorded(start, plant, params.plant, key_record, say)
+            found = self._unstable(params, data[0], key_base, say) if start.closed_loop else None
+        base = self._base(state.base, params, data, key_base, say) if found is None else found.base
         state = state._replace(base=base)
         if not start.gradient_steps:
             return state
@@ -120,7 +121,7 @@ class Trainer:
         if found is None:
             model, of_model = model_of(start, plant, params.plant, data, self.env.observer.history)
         else:
-            model, of_model = counterfactual.plant(plant, self.env.observer.history), found.params
+            model, of_model = counterfactual.plant(plant, found.params.a.shape[1]), found.params
         episodes = TrainingEpisodes(model, self.config.disturbances, self.config.reward)
         learned, more = self.policy_params(state), (reported, begin, devices, say)
         return with_actor(pretrain(start, episodes, of_model, self.policy, learned, keys, *more))
@@ -144,14 +145,34 @@ class Trainer:
         lq.warn_short(plant, found.most)
         return padded(found.law if found.mae < found.static_mae else law, lags)
 
+    def _bank(self, params: EnvParams, key: chex.PRNGKey, say: Say) -> Identified:
+        """Bank of base laws, and the models of its plants."""
+        start, members = self.config.pretraining, self.config.bank
+        return bank.identify(
+            self._longer,
+            params.plant,
+            members,
+            key,
+            self.env.observer.lags,
+            start.episodes,
+            start.closed_loop,
+            lambda done: say("recording", done, len(members)),
+        )
+
     def _unstable(self, params: EnvParams, data: Record, key: chex.PRNGKey, say: Say) -> Identified:
         """Base law and model of a plant that is unstable alone."""
         say("recording", 0, 0)
         plant, start, observer = self.env.plant, self.config.pretraining, self.env.observer
         static = steady_state.static(plant, params.plant, key)[1]
-        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
         of_law = jax.random.fold_in(key, BASE), observer.history, self.config.disturbances, static
-        return unstable.identify(longer, params.plant, data, *of_law, start.closed_loop)
+        found = unstable.identify(self._longer, params.plant, data, *of_law, start.closed_loop)
+        return Identified(padded(found.chosen.law, observer.lags), found.params)
+
+    @property
+    def _longer(self) -> Plant:
+        """The plant with episodes as long as those recorded."""
+        plant, start = self.env.plant, self.config.pretraining
+        return replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def _fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
@@ -222,12 +243,15 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
         of_base = max(lq.lags_for(longer, env.observer.history))
         env = replace(env, observer=replace(env.observer, lags=of_base))
+    if config.base == "bank":
+        env = replace(env, observer=replace(env.observer, lags=lags))
+    observer = replace(env.observer, laws=len(config.bank))
     # The functions are the same for all seeds, so they are compiled once.
     config = replace(config, seed=0, seeds=1, devices=1)
-    agent = config.agent.build(env.observer.size, config.agent_updates, AXIS if shards > 1 else None)
+    agent = config.agent.build(observer.size, config.agent_updates, AXIS if shards > 1 else None)
     environments = Environments(
         env,
-        LearnedPolicy(env.observer, config.agent.hidden, config.correction * float(np.ptp(plant.r_tilde_bounds)) / 2),
+        LearnedPolicy(observer, config.agent.hidden, config.correction * float(np.ptp(plant.r_tilde_bounds)) / 2),
         agent,
         count=config.environments // shards,
         steps=config.steps,

@@ -91,6 +91,18 @@ def test_a_run_is_that_of_the_command_to_the_last_bit(run, tmp_path, capsys):
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_bank_of_laws_is_learned_on_told_and_exported(tmp_path):
+    of_two = tuple((0.1, (("tau", tau),)) for tau in (3.0, 6.0))
+    start = {"gradient_steps": 2, "episodes": 8, "closed_loop": 4, "batch_size": 4}
+    found = jaxouter.learn(
+        ROOM, "record", out=tmp_path / "run", progress=False, base="bank", bank=of_two, compared=0, pretraining=start
+    )
+    assert [each.policy for each in found.summary.results] == ["learned", "none", "static", "bank"]
+    assert set(found.summary.places.values()) <= {"inside", "edge", "outside"}
+    assert (found.policy.spec.laws, found.policy.policy.observer.laws) == (2, 2)
+    assert "verified" in found.export(tmp_path / "controller.npz", force=True)
+
+
 def test_its_path_config_metrics_and_summary(run):
     assert run.config.plant == "Room(tau=4)"
     assert (run.seed, run.seeds) == (0, (0,))

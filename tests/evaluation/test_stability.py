@@ -15,6 +15,7 @@ import scipy.linalg
 from jaxouter.evaluation.baselines.pi import PI, PIParams
 from jaxouter.evaluation.stability import LocalStability, analyse, spectral_radius
 from jaxouter.identification import steady_state
+from jaxouter.loop import bank
 from jaxouter.loop.observation import Observer
 from jaxouter.loop.policy import Policy, affine, none
 from jaxouter.plants import Plant, make
@@ -384,3 +385,17 @@ def test_spectral_radius_of_many_variables_is_that_of_few() -> None:
     matrix = np.block([[block, coupling], [np.zeros((700, 500)), line]])
     assert spectral_radius(matrix) == pytest.approx(largest(block), rel=1e-9)
     assert spectral_radius(line) == 0.0
+
+
+@pytest.mark.parametrize("K", [0.5, 2.0])
+def test_of_a_bank_the_law_that_acts_at_the_equilibrium_is_analysed(K: float) -> None:
+    plant, params = lag.make(K=K, T=5.0, d=0.0)
+    pole = np.exp(-lag.CONTROL_STEP / 5.0)
+    models = [[[pole, 0.0]] * 2, [[gain * (1.0 - pole), 0.0] for gain in (0.5, 2.0)]]
+    made = bank.of([affine(1.0 / gain, 0.0, 2) for gain in (0.5, 2.0)], *models, 1.0)
+    policy = LearnedPolicy(replace(Observer.of(plant, 3, lags=2), laws=2), (8, 8), 1.0)
+    idle = jax.tree.map(jnp.zeros_like, policy.init_actor(KEY))
+    found = one(policy, LearnedParams(idle, made), plant, params)
+    assert found.r_tilde == pytest.approx(0.5 / K, rel=1e-6)
+    assert found.spectral_radius == pytest.approx(pole, rel=1e-6)
+    assert found.note == ""

@@ -27,8 +27,10 @@ from fmpy.validation import validate_fmu
 from jaxouter import export, plants
 from jaxouter.exports import c, files, fmu, verify
 from jaxouter.exports.spec import ControllerSpec
+from jaxouter.loop import bank
 from jaxouter.loop.policy import LinearLaw
 from jaxouter.plants import registry
+from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import RunFolder
 from tests.load import ROOT
 from tests.training.small import small
@@ -120,6 +122,26 @@ def test_a_base_law_with_lags_is_written_too(pitch, kind, lags, tmp_path):
     params = pitch.params._replace(base=law)
     spec = ControllerSpec.of(policy, params, pitch.run.trainer[0].env.plant)
     assert (spec.lags, spec.remembered) == (lags, max(3, lags))
+    path = tmp_path / f"controller.{kind}"
+    files._write(kind, path, spec, policy, params)
+    assert verify.verify(kind, path, spec, policy, params).small
+
+
+@pytest.mark.parametrize("kind", files.FORMATS)
+def test_a_bank_of_laws_is_written_too(pitch, kind, tmp_path):
+    """Random laws and models, of which now one and now another predicts best."""
+    rng, lags, laws = np.random.default_rng(16), 7, 3
+    numbers = 0.1 * rng.normal(size=(laws, 2, lags))
+    each = [LinearLaw(*(jnp.asarray(x, float) for x in (0.5, 0.5, -0.2, *past))) for past in numbers]
+    made = bank.of(each, *(0.3 * rng.normal(size=(2, laws, lags))), 17.0)
+    observer = dataclasses.replace(pitch.policy.observer, lags=lags, laws=laws)
+    policy = dataclasses.replace(pitch.policy, observer=observer)
+    actor = policy.init_actor(jax.random.key(1))
+    params = LearnedParams(jax.tree.map(lambda leaf: 3.0 * leaf, actor), made)
+    spec = ControllerSpec.of(policy, params, pitch.run.trainer[0].env.plant)
+    assert (spec.laws, spec.lags, spec.model_lags, spec.remembered) == (laws, lags, lags, lags)
+    active = verify.signals(spec, policy, params).state.evidence.active
+    assert (active[0], set(active[1:].tolist())) == (-1, {0, 1, 2})
     path = tmp_path / f"controller.{kind}"
     files._write(kind, path, spec, policy, params)
     assert verify.verify(kind, path, spec, policy, params).small

@@ -15,6 +15,7 @@ import pytest
 
 import jaxouter
 from jaxouter.loop import rewards, sensor
+from jaxouter.loop.bank import Evidence
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Memory, Observer, Signals
 from jaxouter.plants import Plant
@@ -178,7 +179,8 @@ def test_observations_of_a_held_reference_are_those_seen_under_it(recorded: Reco
 
 def test_nothing_but_references_and_outputs_is_recorded() -> None:
     assert Signals._fields == ("r", "y", "integral", "r_tilde", "age", "r_next", "y_next")
-    assert Memory._fields == ("y_past", "r_tilde_past", "integral")
+    assert Memory._fields == ("y_past", "r_tilde_past", "integral", "evidence")
+    assert Evidence._fields == ("mean_error", "performance", "active")  # of predictions of y from past y and r~
 
 
 @pytest.mark.parametrize(

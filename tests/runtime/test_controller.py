@@ -35,7 +35,9 @@ def pitch() -> ControllerSpec:
 def static(pitch: ControllerSpec) -> ControllerSpec:
     """r~ = 3 r, whatever y."""
     nothing = tuple(np.zeros_like(array) for array in pitch.weights), tuple(np.zeros_like(b) for b in pitch.biases)
-    return dataclasses.replace(pitch, base_r=3.0, base_offset=0.0, weights=nothing[0], biases=nothing[1])
+    return dataclasses.replace(
+        pitch, base_r=np.float32([3]), base_offset=np.float32([0]), weights=nothing[0], biases=nothing[1]
+    )
 
 
 def run(controller: Controller, samples, r=10.0) -> list[float]:
@@ -102,7 +104,7 @@ def test_going_and_coming_by_itself_has_no_bumps(static):
 def test_in_closed_loop_no_move_is_larger_than_its_part(pitch):
     plant, params = plants.make("pitch")
     rows: list[Row] = []
-    spec = dataclasses.replace(pitch, base_r=2.0, weights=(*pitch.weights[:-1], 0.3 * pitch.weights[-1]))
+    spec = dataclasses.replace(pitch, base_r=np.float32([2]), weights=(*pitch.weights[:-1], 0.3 * pitch.weights[-1]))
     controller = Controller(spec, engaged=False, record=rows.append)
     key = jax.random.key(0)
     state, step = plant.init(key, params), jax.jit(plant.step)

@@ -79,6 +79,36 @@ def test_errors_name_field_value_and_what_is_allowed(change, text):
         with_options(preset("pitch", "record"), change).check()
 
 
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"base": "lq"}, "base is lq and bank has 12 plants; a bank needs --base bank, and plants that a preset"),
+        ({"bank": ()}, "base is bank and bank has 0 plants; a bank needs"),
+        ({"bank": ((0.1, (("d1", 0.4),)),)}, "bank has 1 plants; it must have 2 to 12"),
+        (
+            {"bank": ((0.1, (("d1", 0.4),)), (0.1, (("d3", 0.4),)))},
+            "a plant of the bank sets 'd3'; the numbers are:",
+        ),
+        (
+            {"randomise": (("gain", 0.8, 1.2),), "pretraining.closed_loop": 0},
+            "randomise must be empty with --base bank",
+        ),
+        ({"steps": 16_000}, "steps is 16000; it must be 0 with --base bank, which is for pretraining alone"),
+        ({"compared": 8, "pairs.rounds": 1}, "pairs.rounds is 1; it must be 0 with --base bank"),
+    ],
+)
+def test_a_bank_is_for_pretraining_alone(change, text):
+    with pytest.raises(ValueError, match=text):
+        with_options(preset("pitch", "robust"), change).check()
+
+
+def test_a_bank_survives_json_and_counts_what_is_recorded():
+    config = preset("pitch", "robust").check()
+    assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
+    assert config.identification_steps == 12 * (64 + 128) * 400
+    assert {name: ends for name, *ends in config.ranges}["d2"] == [0.0, 5.9]
+
+
 def test_unknown_preset_lists_those_that_exist():
     with pytest.raises(ValueError, match="no preset 'fast' for heaters; the presets are: default, scratch, record,"):
         preset("heaters", "fast")

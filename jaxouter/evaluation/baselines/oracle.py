@@ -81,9 +81,8 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
         trainer, params = build_trainer(config)
         key_actor, key_static, key_drawn, *keys = jax.random.split(jax.random.key(0), 5)
         plant, of_plant = replace(trainer.env.plant, reward_terms=()), params.plant
-        learned = LearnedParams(
-            trainer.agent.actor(trainer.agent.init(key_actor)), static(*make(config.plant), key_static)[1]
-        )
+        law = static(*make(config.plant), key_static)[1]
+        learned = LearnedParams(trainer.agent.actor(trainer.agent.init(key_actor)), law)
         longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
         try:
             of_plant = counterfactual.simulated(longer, of_plant, key_drawn, DRAWN)
@@ -97,7 +96,7 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
         episodes = TrainingEpisodes(plant, config.disturbances, ERROR)
         actor = pretrain(start, episodes, of_plant, trainer.policy, learned, keys, heard)
         steps = start.gradient_steps * start.batch_size * longer.episode_steps
-        return kept(actor, learned.base, {"gradient_steps": start.gradient_steps}, steps)
+        return kept(actor, law, {"gradient_steps": start.gradient_steps}, steps)
 
     key = {"config": to_dict(replace(config, seed=0, seeds=1, devices=1))}
     return cached(f"{config.plant}-oracle-{config.preset}", key, make_it)
