@@ -1,6 +1,6 @@
 """What one policy with a bank of base laws holds: the paper's five plants, and families on the nominal one.
 
-    python benchmarks/bank.py runs/pitch-robust-0      # results/bank.json, and two tables
+    python benchmarks/bank.py runs/pitch-robust-0      # results/bank.json, two tables and a figure
 
 Columns are those of `unstable.py`: from rest without and with sensor noise, and the share that is held of the drawn
 starts that some r~ can bring back. The families are compared with the limit in results/compare-pitch.csv.
@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import tyro
 from tables import made, table
-from unstable import NOISE, RESULTS, measured, possible
+from unstable import NOISE, RESULTS, drawn, measured, possible
 
 from jaxouter import cli
 from jaxouter.evaluation import cache, scenarios
@@ -60,6 +60,7 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         name: [mae(rollout(one.policy, one.params, scenarios.get(f"pitch/{name}"))) for one in learned]
         for name in FAMILIES
     }
+    drawn({"paper": first, "delay-5.7": first}, RESULTS / "bank.png")
     about: dict[str, Any] = {"machine": surroundings(), "can be held": could, "held": held, "families": of_families}
     write_json(RESULTS / "bank.json", about)
     spread = f"Median (least to greatest) of {len(learned)} seeds."

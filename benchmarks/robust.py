@@ -3,7 +3,7 @@
 Each plant starts 64 times as in training and is then asked for the scenario's set-point, for 600 steps. It is held
 where |y| stays within its limit in all of the last 300. The limit is the oracle, retrained on the same drawn plants.
 
-    python benchmarks/robust.py runs/pitch-robust-0      # results/robust-pitch.json, and two tables
+    python benchmarks/robust.py runs/heaters-robust-0      # results/robust-heaters.json, and two tables
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@
 
 From rest: the MAE in 20 s of the scenario, without and with sensor noise of 0.1 crad. Drawn starts: 64 as in training,
 then the scenario's set-point for 600 steps; held where |y| is within its limit in all of the last 300, counted among
-those that some r~ within its bounds can bring back, by a linear programme on the plant. Table and numbers go to
-results/.
+those that some r~ within its bounds can bring back, by a linear programme on the plant. Table, numbers and figure go to
+results/. The figure has the paper's four panels: the nominal plant with what `default` learned on it, delay-5.7 with
+what it learned there.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from tables import made, table
 
 import jaxouter
 from jaxouter import cli
-from jaxouter.evaluation import scenarios
+from jaxouter.evaluation import figures, scenarios
 from jaxouter.evaluation.baselines.clairvoyant import Replay
 from jaxouter.evaluation.metrics import held, mae
-from jaxouter.evaluation.policies import NamedPolicy
+from jaxouter.evaluation.policies import NamedPolicy, baseline
 from jaxouter.evaluation.rollout import rollout
 from jaxouter.evaluation.scenarios import Scenario
 from jaxouter.identification.records import Record
@@ -53,6 +54,25 @@ def possible(scenario: Scenario, steps: int = 200) -> np.ndarray:
     return can_be_brought_back(scenario.plant, Record(nothing, y), (moved.y - free.y)[0] / high)
 
 
+def learned(seed: int, settings: dict[str, Any]) -> tuple[NamedPolicy, float]:
+    """What `default` learns on the plant with these settings, and the seconds of the whole run."""
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.perf_counter()
+        run = jaxouter.learn("pitch", set=settings, seed=seed, out=Path(folder) / "run", progress=False)
+        seconds = time.perf_counter() - begun
+        opened = RunFolder.open(run.path)
+        return NamedPolicy("learned", opened.trainer[0].policy, opened.policy(seed)[1], opened.config.plant), seconds
+
+
+def drawn(policies: Mapping[str, NamedPolicy], path: Path) -> None:
+    """The paper's panels: the inner loop alone and with the policy of each case, and r~ below."""
+    on = {f"pitch/{case}": named for case, named in policies.items()}
+    alone = baseline("none", "pitch")
+    inner = {name: rollout(alone.policy, alone.params, scenarios.get(name)) for name in on}
+    with_outer = {name: rollout(named.policy, named.params, scenarios.get(name)) for name, named in on.items()}
+    figures.keep(figures.response([scenarios.get(name) for name in on], inner, with_outer), path)
+
+
 def measured(named: NamedPolicy, case: str) -> dict[str, float]:
     """What a policy holds."""
     alone = scenarios.get(f"pitch/{case}")
@@ -70,14 +90,10 @@ def main(seeds: int = 5) -> None:
         could = float(np.mean(possible(scenarios.perturbed(f"pitch/{case}"))))
         found: list[dict[str, float]] = []
         for seed in range(seeds):
-            with tempfile.TemporaryDirectory() as folder:
-                begun = time.perf_counter()
-                run = jaxouter.learn("pitch", set=settings, seed=seed, out=Path(folder) / "run", progress=False)
-                seconds = time.perf_counter() - begun
-                opened = RunFolder.open(run.path)
-                trainer, _ = opened.trainer
-                named = NamedPolicy("learned", trainer.policy, opened.policy(seed)[1], opened.config.plant)
-                found.append(measured(named, case) | {"seconds": seconds})
+            named, seconds = learned(seed, settings)
+            found.append(measured(named, case) | {"seconds": seconds})
+            if (case, seed) == ("delay-5.7", 0):
+                drawn({"paper": learned(0, {})[0], case: named}, RESULTS / "unstable.png")
             print(case, seed, found[-1], flush=True)
         kept[case] = {"can be held": could, "seeds": found}
 

@@ -147,12 +147,14 @@ def numbers(content: Any, keys: tuple[str, ...]) -> Any:
 def differences(wanted: Any, found: Any, exact: bool, name: str = "") -> list[str]:
     """Differences, by name."""
     amplified = not exact and AMPLIFIED.search(name) is not None
-    if isinstance(wanted, dict) and isinstance(found, dict) and set(wanted) == set(found):
+    if isinstance(wanted, dict) and isinstance(found, dict):
         if "elements" in wanted and not exact:
             pair = np.array([wanted["elements"], found["elements"]])
             close = np.abs(pair[0] - pair[1]).max(initial=0.0) <= TOLERANCE * np.abs(pair).max(initial=0.0)
             return [] if close or amplified else [f"{name}: {found['elements']}, not {wanted['elements']}"]
-        return [text for key in wanted for text in differences(wanted[key], found[key], exact, f"{name}/{key}")]
+        once = [f"{name}/{key} is {'missing' if key in wanted else 'new'}" for key in sorted(set(wanted) ^ set(found))]
+        both = [key for key in wanted if key in found]
+        return once + [text for key in both for text in differences(wanted[key], found[key], exact, f"{name}/{key}")]
     if isinstance(wanted, list) and isinstance(found, list) and len(wanted) == len(found):
         pairs = enumerate(zip(wanted, found, strict=True))
         return [text for i, pair in pairs for text in differences(*pair, exact, f"{name}/{i}")]

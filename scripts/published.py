@@ -40,6 +40,8 @@ MAKERS = (  # what a file's name begins with, the most special first, and what m
     ("over-base", "python benchmarks/over_base.py"),
     ("time-to-quality", "python benchmarks/time_to_quality.py --peers"),
     ("unstable", "python benchmarks/unstable.py"),
+    ("bank", f"{TRAIN} pitch --preset robust --devices 2; python benchmarks/bank.py runs/pitch-robust-0"),
+    ("undecided", "python benchmarks/undecided.py"),
     ("throughput", "python benchmarks/throughput.py --peers"),
     ("controller", "python benchmarks/controller.py"),
     ("presets", "the commands that it names"),

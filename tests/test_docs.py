@@ -65,7 +65,7 @@ def test_a_figure_that_is_not_there_ends_the_build():
 
 def test_what_is_shown_is_there_and_has_a_command_that_makes_it():
     shown = published.shown()
-    assert {"animation.webp", "compare-pitch.csv", "pitch-paper.json", "robust-pitch.md"} <= set(shown)
+    assert {"animation.webp", "compare-pitch.csv", "pitch-paper.json", "robust-heaters.md"} <= set(shown)
     assert [name for name in shown if not (published.RESULTS / name).is_file()] == []
     commands = {name: published.maker(name) for name in shown}
     assert [name for name, command in commands.items() if command is None] == []

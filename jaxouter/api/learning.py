@@ -32,6 +32,7 @@ from jaxouter.evaluation.policies import (
     result,
 )
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.identification import bank
 from jaxouter.identification.dynamics import exploration
 from jaxouter.loop import rewards
 from jaxouter.loop.bank import Bank
@@ -411,6 +412,9 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
     by_mae = sorted(learned, key=lambda seed: learned[seed][selected[0].id].figures.mae or np.inf)
     median = by_mae[(len(by_mae) - 1) // 2]
     key = jax.random.fold_in(jax.random.key(config.seed), FRESH)
+    trained_on = trainer.env.plant, params.plant
+    if config.bank:
+        trained_on = bank.drawing(*trained_on, config.bank)
     linear = {name: named.params for name, named in simple.items() if name != "bank"}
     terms = [term.__name__ for term in trainer.env.plant.reward_terms]
     summary = TrainingSummary(
@@ -423,7 +427,7 @@ def report(run: RunFolder, finals: dict[int, TrainState], progress: Progress, ep
         reward=TrainedReward(vars(config.reward), terms, vars(rewards.PAPER) | {"terms": 0.0}),
         places={scenario.id: scenarios.place(scenario, *run.drawn) for scenario in selected},
         episodes={scenario.id: len(scenario.r) for scenario in selected},
-        verdict=verdict.judge(trainer.env.plant, params.plant, key, trainer.policy, of_seeds, linear),
+        verdict=verdict.judge(*trained_on, key, trainer.policy, of_seeds, linear),
         results=[
             result("learned", results, seed=seed, trained_return=trained(results)) for seed, results in learned.items()
         ]

@@ -8,6 +8,7 @@ actor for all of these plants replays the episodes (`counterfactual`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import chex
@@ -27,11 +28,11 @@ from jaxouter.plants import Plant, Ranges
 from jaxouter.plants.arx import Model
 
 Member = tuple[float, tuple[tuple[str, float], ...]]
-"""A plant that a bank has a law for: the price of moves in its law, and the plant's numbers by name."""
+"""A plant that a bank has a law for: the price of moves in it, see `lq.PRICES`, and the plant's numbers by name."""
 
 
-class Identified(NamedTuple):
-    """What records gave."""
+class Basis(NamedTuple):
+    """Base law, and models to pretrain an actor on."""
 
     base: BaseLaw
     params: CounterfactualParams  # of their models, on which each episode replays a recorded start
@@ -63,6 +64,22 @@ def ranges(params: Any, members: Sequence[Member]) -> Ranges:
     return tuple((name, min(values), max(values)) for name, values in found.items())
 
 
+def drawing(plant: Plant, params: Any, members: Sequence[Member]) -> tuple[Plant, Any]:
+    """The plant that draws one of the members for each episode, and its parameters; arguments as for `identify`."""
+    each = [plants.with_numbers(_widened(plant, params, members), dict(numbers)) for _, numbers in members]
+
+    def draw(key: chex.PRNGKey, params: Any) -> Any:
+        i = jax.random.randint(key, (), 0, len(members))
+        return jax.tree.map(lambda leaf: leaf[i], params)
+
+    return replace(plant, draw=draw), jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def _widened(plant: Plant, params: Any, members: Sequence[Member]) -> Any:
+    """The parameters of a plant that can take those of all members."""
+    return plant.widened(params, {name: (low, high) for name, low, high in ranges(params, members)})
+
+
 def identify(
     plant: Plant,
     params: Any,
@@ -72,7 +89,7 @@ def identify(
     episodes: int,
     closed_loop: int,
     say: Callable[[int], None] = lambda done: None,
-) -> Identified:
+) -> Basis:
     """Laws and models of all members.
 
     Args:
@@ -88,7 +105,7 @@ def identify(
     Raises:
         ValueError: a name is not a number of the plant, or no recorded start of a member can be brought back.
     """
-    params = plant.widened(params, {name: (low, high) for name, low, high in ranges(params, members)})
+    params = _widened(plant, params, members)
     found = []
     for i, (price, numbers) in enumerate(members):
         say(i)
@@ -106,7 +123,7 @@ def identify(
     known = (np.repeat(a, counts, 0), np.repeat(b, counts, 0), r_tilde, y, y)
     half = float(np.ptp(plant.setpoint_range)) / 2
     made = bank.of([each.law for each in found], a, b, half)
-    return Identified(made, CounterfactualParams(*(jnp.asarray(each, float) for each in known)))
+    return Basis(made, CounterfactualParams(*(jnp.asarray(each, float) for each in known)))
 
 
 def _law(
@@ -130,5 +147,4 @@ def _law(
 def _of(plant: Plant, data: Record, price: float, lags: int) -> tuple[LinearLaw, Model]:
     """LQ law and model of a record."""
     model = unstable.fit(plant, data, lags)
-    of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
-    return lq.law(model.a, model.b, price * (of_y / of_r_tilde) ** 2), model
+    return lq.law_for(plant, model.a, model.b, price), model

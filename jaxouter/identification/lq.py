@@ -126,6 +126,12 @@ def law(a: np.ndarray, b: np.ndarray, price: float) -> LinearLaw:
     return LinearLaw(np.zeros(()), K[0], -K[0], -np.diff(of_y, append=0.0), r_tilde_past)  # type: ignore[arg-type]
 
 
+def law_for(plant: Plant, a: np.ndarray, b: np.ndarray, price: float) -> LinearLaw:
+    """`law` with the price of a squared move in squared errors, both in half ranges of the plant, as in `PRICES`."""
+    of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
+    return law(a, b, price * (of_y / of_r_tilde) ** 2)
+
+
 def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, price: float) -> np.ndarray:
     """P of P = Q + A' P A - A' P B (price + B' P B)^-1 B' P A, by doubling the horizon.
 
@@ -291,12 +297,12 @@ def _candidates(
     plant: Plant, data: Record, lags: Sequence[int], noises: Sequence[float], prices: Sequence[float]
 ) -> Iterator[tuple[Settings, LinearLaw]]:
     """The laws that are compared."""
-    of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
+    of_y = float(np.ptp(plant.setpoint_range)) / 2
     for n in lags:
         models = fits(data, n, [noise * of_y for noise in noises])
         for noise, (a, b) in zip(noises, models, strict=True):
             for price in prices:
-                yield Settings(n, noise, price), law(a, b, price * (of_y / of_r_tilde) ** 2)
+                yield Settings(n, noise, price), law_for(plant, a, b, price)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 1})

@@ -192,8 +192,7 @@ def continued(plant: Plant, data: Record, model: Model) -> Record:
     n, steps = len(model.a), data.r_tilde.shape[1]
     last = np.where(np.isnan(data.y).any(1), np.isnan(data.y).argmax(1) - 1, steps)  # of the known y
     y, r_tilde, last = (each[last >= n] for each in (data.y, data.r_tilde, last))
-    of_y, of_r_tilde = (float(np.ptp(each)) / 2 for each in (plant.setpoint_range, plant.r_tilde_bounds))
-    law = LinearLaw(*map(np.asarray, lq.law(model.a, model.b, (of_y / of_r_tilde) ** 2)))  # type: ignore[arg-type]
+    law = LinearLaw(*map(np.asarray, lq.law_for(plant, model.a, model.b, 1.0)))  # type: ignore[arg-type]
     middle = sum(plant.setpoint_range) / 2
     y_new, r_tilde_new = np.repeat(y[:, :1], steps + 1, 1), np.zeros_like(r_tilde)
     y_past = np.repeat(y[:, :1], n, 1)

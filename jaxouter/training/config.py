@@ -196,11 +196,14 @@ class TrainConfig:
         for name, value in (("steps", self.steps), ("pairs.rounds", self.pairs.rounds), ("compared", self.compared)):
             if value:
                 raise ValueError(f"{name} is {value}; it must be 0 with --base bank, which is for pretraining alone")
-        ranges(plants.make(self.plant)[1], self.bank)
 
     @property
     def ranges(self) -> plants.Ranges:
-        """Parameters of the plants of the training: name, least and greatest value."""
+        """Parameters of the plants of the training: name, least and greatest value.
+
+        Raises:
+            ValueError: a plant of the bank sets a parameter that there is not; lists those.
+        """
         return ranges(plants.make(self.plant)[1], self.bank) if self.bank else self.randomise
 
     @property

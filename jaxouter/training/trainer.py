@@ -20,7 +20,7 @@ from jaxouter.agents.agent import OffPolicyAgent
 from jaxouter.agents.pairs import PairsLearner
 from jaxouter.agents.replay import Replay
 from jaxouter.identification import bank, counterfactual, lq, steady_state, unstable
-from jaxouter.identification.bank import Identified
+from jaxouter.identification.bank import Basis
 from jaxouter.identification.records import Record, within
 from jaxouter.loop import environment
 from jaxouter.loop.environment import Environment, EnvParams
@@ -145,7 +145,7 @@ class Trainer:
         lq.warn_short(plant, found.most)
         return padded(found.law if found.mae < found.static_mae else law, lags)
 
-    def _bank(self, params: EnvParams, key: chex.PRNGKey, say: Say) -> Identified:
+    def _bank(self, params: EnvParams, key: chex.PRNGKey, say: Say) -> Basis:
         """Bank of base laws, and the models of its plants."""
         start, members = self.config.pretraining, self.config.bank
         return bank.identify(
@@ -159,14 +159,14 @@ class Trainer:
             lambda done: say("recording", done, len(members)),
         )
 
-    def _unstable(self, params: EnvParams, data: Record, key: chex.PRNGKey, say: Say) -> Identified:
+    def _unstable(self, params: EnvParams, data: Record, key: chex.PRNGKey, say: Say) -> Basis:
         """Base law and model of a plant that is unstable alone."""
         say("recording", 0, 0)
         plant, start, observer = self.env.plant, self.config.pretraining, self.env.observer
         static = steady_state.static(plant, params.plant, key)[1]
         of_law = jax.random.fold_in(key, BASE), observer.history, self.config.disturbances, static
         found = unstable.identify(self._longer, params.plant, data, *of_law, start.closed_loop)
-        return Identified(padded(found.chosen.law, observer.lags), found.params)
+        return Basis(padded(found.chosen.law, observer.lags), found.params)
 
     @property
     def _longer(self) -> Plant:
@@ -243,7 +243,8 @@ def build(config: TrainConfig, shards: int = 1) -> tuple[Trainer, EnvParams]:
         longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
         of_base = max(lq.lags_for(longer, env.observer.history))
         env = replace(env, observer=replace(env.observer, lags=of_base))
-    if config.base == "bank":
+    if config.bank:
+        bank.ranges(params.plant, config.bank)  # raises ValueError if a name is wrong
         env = replace(env, observer=replace(env.observer, lags=lags))
     observer = replace(env.observer, laws=len(config.bank))
     # The functions are the same for all seeds, so they are compiled once.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +76,12 @@ def test_worse_is_worse_by_however_little() -> None:
     assert _is_worse(1.0 + np.array([0.2, -0.1, 0.0, 0.0]), np.ones(4))
     assert not _is_worse(np.ones(4), np.ones(4))
     assert not _is_worse(np.ones(4), np.full(4, np.inf))
+
+
+def test_an_episode_counts_as_the_range_of_set_points_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "PLANT", replace(PLANT, setpoint_range=(-0.1, 0.1)))
+    mae: Any = judged(s0=-1e6).mae  # r~ at its bounds
+    assert mae["learned"]["0"] == pytest.approx(0.2, abs=1e-6)
 
 
 def test_what_diverges_is_worse() -> None:

@@ -55,6 +55,13 @@ def test_ranges_are_those_of_the_members_and_the_nominal_plant():
         bank.ranges(params, ((0.1, (("gain", 2.0),)),))
 
 
+def test_an_episode_is_on_one_of_the_members():
+    plant, params = bank.drawing(*lag.make(K=1.0, d=0.2), MEMBERS)
+    drawn = jax.vmap(plant.draw, (0, None))(jax.random.split(jax.random.key(0), 32), params)
+    assert set(np.asarray(drawn.K).tolist()) == set(GAINS)
+    np.testing.assert_allclose(drawn.T, params.T[0])
+
+
 def test_a_member_that_no_r_tilde_holds_is_refused():
     plant, params = kinds.kind([0.9], [0.01], divergence_bounds=(-12.0, 12.0), r_tilde_bounds=(-0.01, 0.01))()
     text = r"brings back none of the 16 recorded starts of a plant of the bank: a\[0\] 1\.2"
