@@ -2,7 +2,7 @@
 
     python scripts/golden.py            # compares with tests/golden.json; status 1 if anything differs
     python scripts/golden.py --write    # writes that file again
-    python scripts/golden.py --only heaters-td3    # only this training and what depends on it
+    python scripts/golden.py --only heaters-td3    # only this training and what depends on it; the others stay
 
 The file holds a hash and a few elements of every array. On the same kind of machine and version of jaxlib the hashes
 must agree (equality to the last bit); elsewhere the elements must agree to a small tolerance.
@@ -55,6 +55,8 @@ def main(write: bool = False, only: tuple[str, ...] = ()) -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         found = {"machine": machine(), "results": dict(sorted(results(Path(folder), only).items()))}
     if write:
+        others = json.loads(FILE.read_text())["results"] if only else {}
+        found["results"] = dict(sorted((others | found["results"]).items()))
         FILE.write_text(json.dumps(found, indent=0) + "\n")
         print(f"{len(found['results'])} results written to {FILE}")
         return

@@ -86,7 +86,6 @@ def test_errors_name_field_value_and_what_is_allowed(change, text):
         ({"base": "lq"}, "base is lq and bank has 12 plants; a bank needs --base bank, and plants that a preset"),
         ({"bank": ()}, "base is bank and bank has 0 plants; a bank needs"),
         ({"bank": ((0.1, (("d1", 0.4),)),)}, "bank has 1 plants; it must have 2 to 12"),
-        ({"bank": ((0.1, (("d1", 0.4),)), (0.1, (("d3", 0.4),)))},),
         (
             {"randomise": (("gain", 0.8, 1.2),), "pretraining.closed_loop": 0},
             "randomise must be empty with --base bank",
