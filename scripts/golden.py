@@ -55,8 +55,13 @@ def main(write: bool = False, only: tuple[str, ...] = ()) -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         found = {"machine": machine(), "results": dict(sorted(results(Path(folder), only).items()))}
     if write:
-        others = json.loads(FILE.read_text())["results"] if only else {}
-        found["results"] = dict(sorted((others | found["results"]).items()))
+        if only:
+            others = json.loads(FILE.read_text())
+            if others["machine"] != found["machine"]:
+                raise SystemExit(
+                    "the other results are of another machine or jaxlib; write all of them, without --only"
+                )
+            found["results"] = dict(sorted((others["results"] | found["results"]).items()))
         FILE.write_text(json.dumps(found, indent=0) + "\n")
         print(f"{len(found['results'])} results written to {FILE}")
         return

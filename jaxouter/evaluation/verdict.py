@@ -47,7 +47,8 @@ def judge(
 ) -> Verdict:
     """MAE of the learned policies, by seed, and of affine ones, by name, on fresh training episodes.
 
-    That of an episode counts as the set-point range at most: where y may grow, how often it does so counts.
+    That of an episode counts as the range of the divergence bounds at most: where y may grow, how often it does so
+    counts.
 
     Args:
         plant, params: of the training distribution.
@@ -63,7 +64,7 @@ def judge(
     def of(policy_params: LearnedParams) -> np.ndarray:
         strong = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), policy_params)  # else compiled for anew
         errors = np.asarray(_errors(plant, policy, count, params, strong, key), np.float64)
-        return np.where(np.isfinite(errors), np.minimum(errors, np.ptp(plant.setpoint_range)), np.inf)
+        return np.where(np.isfinite(errors), np.minimum(errors, np.ptp(plant.divergence_bounds)), np.inf)
 
     base = next(iter(learned.values())).base  # with a bank, laws of one, so that all share a compiled function
     alike = {name: base.all_of(law) if isinstance(base, Bank) else law for name, law in simple.items()}

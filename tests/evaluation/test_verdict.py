@@ -78,8 +78,8 @@ def test_worse_is_worse_by_however_little() -> None:
     assert not _is_worse(np.ones(4), np.full(4, np.inf))
 
 
-def test_an_episode_counts_as_the_range_of_set_points_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules[__name__], "PLANT", replace(PLANT, setpoint_range=(-0.1, 0.1)))
+def test_an_episode_counts_as_the_range_of_the_divergence_bounds_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "PLANT", replace(PLANT, divergence_bounds=(-0.1, 0.1)))
     mae: Any = judged(s0=-1e6).mae  # r~ at its bounds
     assert mae["learned"]["0"] == pytest.approx(0.2, abs=1e-6)
 
