@@ -63,7 +63,7 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     drawn({"paper": first, "delay-5.7": first}, RESULTS / "bank.png")
     about: dict[str, Any] = {"machine": surroundings(), "can be held": could, "held": held, "families": of_families}
     write_json(RESULTS / "bank.json", about)
-    spread = f"Median (least to greatest) of {len(learned)} seeds."
+    spread = f"Median (least to greatest) of {len(learned)} seeds." if len(learned) > 1 else "One seed."
     text = f"{of_plants(could, held)}\n\n{of_references(of_families)}\n\n{spread} "
     text += made(f"python benchmarks/bank.py {' '.join(map(str, runs))}")
     (RESULTS / "bank.md").write_text(text + "\n")
