@@ -101,7 +101,7 @@ class Trainer:
         plant, start = self.env.plant, self.config.pretraining
         key_record, *keys = jax.random.split(jax.random.fold_in(key_base, PRETRAINING), 3)
         of_plant = self.config.base == "lq" or not plant.identified
-        data, found = [], None  # model and base law of what is not identified as `default` is
+        data, found = [], None  # base law and models, where one identification gives both
         if self.config.base == "bank":
             found = self._bank(params, key_record, say)
         elif self.config.records and of_plant:

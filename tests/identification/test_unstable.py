@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.identification import unstable
+from jaxouter.identification import lq, unstable
 from jaxouter.identification.linear_models import impulse_response, radius
 from jaxouter.identification.records import Record, record, within
 from jaxouter.identification.steady_state import IdentificationWarning
@@ -93,6 +93,15 @@ def test_the_law_of_diverging_records_holds_the_plant(diverging):
     assert np.abs(np.array(ys[100:]) - 0.5).max() < 0.02
     assert found.params.y.shape == (len(found.params.a), kinds.EPISODE + 1)
     assert bool(jnp.isfinite(found.params.y).all())
+
+
+def test_some_episodes_in_closed_loop_begin_at_rest(diverging):
+    plant, params, _ = diverging
+    law = lq.law_for(plant, np.array([A, 0.0]), np.array([B, 0.0]), 1.0)
+    found = unstable.in_closed_loop(plant, params, law, kinds.key(5), 8, 5)
+    assert len(found.y) == 8
+    assert (found.y[:5, 0] == 0.0).all()
+    assert (found.y[5:, 0] != 0.0).all()
 
 
 def test_what_no_r_tilde_can_hold_is_refused_with_the_reason():
