@@ -1,7 +1,7 @@
 """Wall time and environment steps until the MAE on pitch/paper is within 1.25, 1.10 and 1.05 of the limit.
 
     python benchmarks/time_to_quality.py                 # our presets, five seeds each; 15 minutes
-    python benchmarks/time_to_quality.py --peers         # and DDPG, TD3, SAC of stable-baselines3 and sbx; hours
+    python benchmarks/time_to_quality.py --peers         # and the learners of stable-baselines3 and sbx; hours
 
 Each run is a process of its own that begins with nothing cached, on an otherwise idle machine; its time counts from its
 start, imports and compilation included. Training never sees pitch/paper. Ours are timed by when a row of metrics.jsonl
@@ -41,24 +41,26 @@ OURS = {
     "record": ("--preset", "record"),
     "paper": ("--preset", "paper"),
 }
-PEERS = [(library, learner) for library in ("stable-baselines3", "sbx") for learner in ("DDPG", "TD3", "SAC")]
+PEERS = [(library, learner) for library in ("stable-baselines3", "sbx") for learner in ("DDPG", "TD3", "SAC", "PPO")]
+PEERS.append(("sb3-contrib", "TRPO"))
 NEAR = (1.25, 1.10, 1.05)  # times the limit
 
 Point = dict[str, float]  # seconds, steps, mae
 
 
-def limit() -> float:
+def limit(scenario: str = SCENARIO) -> float:
     """The least MAE of those that know the plant."""
-    on = [scenarios.get(SCENARIO)]
-    found = best({name: evaluate_on(baseline(name, "pitch"), on)[SCENARIO].figures for name in (*LIMITS, *SIMPLE)})
+    on = [scenarios.get(scenario)]
+    policies = {name: baseline(name, scenario.partition("/")[0]) for name in (*LIMITS, *SIMPLE)}
+    found = best({name: evaluate_on(policy, on)[scenario].figures for name, policy in policies.items()})
     assert found is not None
     return found
 
 
-def ours(options: tuple[str, ...], seed: int, below: float, seconds: float) -> Iterator[Point]:
+def ours(options: tuple[str, ...], seed: int, below: float, seconds: float, plant: str = "pitch") -> Iterator[Point]:
     """A training of ours, until the MAE is below or the time is over."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "jaxouter.train", "pitch", *options, "--seed", str(seed), "--out", "run"]
+        command = [sys.executable, "-m", "jaxouter.train", plant, *options, "--seed", str(seed), "--out", "run"]
         environment = os.environ | {"XDG_CACHE_HOME": str(Path(folder) / "cache"), "PYTHONPATH": str(HERE.parent)}
         metrics, seen = Path(folder) / "run" / f"seed-{seed}" / "metrics.jsonl", 0
         begun = time.perf_counter()
@@ -73,6 +75,12 @@ def ours(options: tuple[str, ...], seed: int, below: float, seconds: float) -> I
                         process.kill()
                 seen += len(rows)
             process.kill()
+
+
+def of_peers() -> str:
+    """The interpreter of the peers."""
+    script = ["bash", str(HERE.parent / "scripts" / "peers.sh")]
+    return subprocess.run(script, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def peers(python: str, library: str, learner: str, seed: int, below: float, seconds: float) -> Iterator[Point]:
@@ -108,8 +116,7 @@ def main(
             runs.setdefault(name, []).append(list(ours(options, seed, levels[-1], seconds)))
             print(name, seed, runs[name][-1][-1:], flush=True)
     if with_peers:
-        script = ["bash", str(HERE.parent / "scripts" / "peers.sh")]
-        python = subprocess.run(script, check=True, capture_output=True, text=True).stdout.strip()
+        python = of_peers()
         for library, learner in PEERS:
             for seed in range(seeds):
                 found = list(peers(python, library, learner, seed, levels[-1], seconds))

@@ -13,11 +13,13 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli
+from jaxouter.api.learning import Stopped, learners
 from jaxouter.evaluation import scenarios, statistics
 from jaxouter.evaluation.comparison import REPORT, compare
 from jaxouter.evaluation.results import Comparison
 from jaxouter.plants.base import in_words
 from jaxouter.terminal import console
+from jaxouter.training.epochs import NotFiniteError
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,13 @@ class Options:
 
     plant: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLANT]", help_behavior_hint="")] = None
     """pitch, heaters or your own: FILE.py:NAME, gym:ID, fmu:FILE, log:FILE; default: that of the runs, or pitch."""
-    agent: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE.py:CLASS ...", help_behavior_hint="")] = ()
-    """Agents of the runs, if your own."""
+    agent: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()
+    """Without --run, agents side by side: each first learns from scratch on the static prefilter, unless its run folder
+    runs/PLANT-scratch-AGENT exists. With --run, agents of the runs, if your own."""
+    seeds: int = 1
+    """Seeds of each agent that learns first."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")] = None
+    """Environment steps of each agent that learns first; default: those of its preset, some 20 to 180 s a seed."""
     run: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")] = ()
     """Run folders of `jaxouter.train` (all seeds), or folders of one seed."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|FILE.py:CLASS ...", help_behavior_hint="")] = ()
@@ -63,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             return cli.print_lists()
         content = compare(
             options.plant,
-            options.run,
+            options.run or learned(options),
             options.policy,
             options.scenario,
             options.sweep,
@@ -75,6 +82,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     show(content)
     print(f"{time.perf_counter() - begun:.0f} s in all; report {Path(content.folder) / REPORT}")
+
+
+def learned(options: Options) -> list[Path]:
+    """Run folders of the agents that learn first."""
+    if not options.agent:
+        if options.seeds != 1 or options.steps is not None:
+            raise ValueError("--seeds and --steps are of agents that learn first; name them by --agent")
+        return []
+    plant = options.plant or "pitch"
+    try:
+        runs = learners(plant, options.agent, options.seeds, options.steps, cli.settings(options.set))
+    except (OSError, NotFiniteError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        raise SystemExit(130) from None
+    return [run.path for run in runs]
 
 
 def show(content: Comparison) -> None:

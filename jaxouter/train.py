@@ -93,7 +93,7 @@ def parse(arguments: list[str]) -> Options:
     config = given.config
     with Progress(console, config.plant not in plants.REGISTRY):  # JAX may have to find other processes first
         plant = add(config.plant, config.plant_options, cli.settings(given.set))
-    name = implied(config.preset, config.base)
+    name = implied(config.preset, config.base, agent)
     default = Options(preset(plant, name, agent), agent=agent)
     options = tyro.cli(Options, prog=program, args=arguments, default=default)
     options = dataclasses.replace(options, config=dataclasses.replace(options.config, plant=plant, preset=name))

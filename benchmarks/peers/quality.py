@@ -10,6 +10,7 @@ evaluations took), environment steps, MAE (crad). It ends at the first MAE below
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import time
 
@@ -23,6 +24,7 @@ from stable_baselines3.common.noise import NormalActionNoise  # noqa: E402  # py
 
 ENVIRONMENTS = 8
 SETPOINT = 14.66  # crad, of pitch/paper
+ON_POLICY = ("PPO", "TRPO")
 EVERY = 5 * EPISODE  # environment steps between two evaluations
 
 
@@ -55,21 +57,20 @@ class Watch(BaseCallback):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("package", choices=["stable-baselines3", "sbx"])
-    parser.add_argument("learner", choices=["DDPG", "TD3", "SAC"])
+    parser.add_argument("package", choices=["stable-baselines3", "sb3-contrib", "sbx"])
+    parser.add_argument("learner", choices=["DDPG", "TD3", "SAC", "PPO", "TRPO"])
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--below", type=float, default=0.0, help="MAE at which to stop, crad (default: never)")
     parser.add_argument("--minutes", type=float, default=30.0, help="longest time (default: %(default)s)")
     options = parser.parse_args()
-    if options.package == "sbx":
-        import sbx as learners  # pyright: ignore[reportMissingImports]
-    else:
-        import stable_baselines3 as learners  # pyright: ignore[reportMissingImports]
-    env = make_vec_env(Pitch, ENVIRONMENTS, seed=options.seed)
-    noise = {} if options.learner == "SAC" else {"action_noise": NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))}
-    model = getattr(learners, options.learner)(
-        "MlpPolicy", env, gradient_steps=-1, seed=options.seed, device="cpu", **noise
+    learners = importlib.import_module(
+        {"sbx": "sbx", "sb3-contrib": "sb3_contrib"}.get(options.package, "stable_baselines3")
     )
+    env = make_vec_env(Pitch, ENVIRONMENTS, seed=options.seed)
+    settings = {} if options.learner in ON_POLICY else {"gradient_steps": -1}
+    if options.learner in ("DDPG", "TD3"):
+        settings["action_noise"] = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    model = getattr(learners, options.learner)("MlpPolicy", env, seed=options.seed, device="cpu", **settings)
     model.learn(10**9, callback=Watch(options.below, 60 * options.minutes))
 
 

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from jaxouter.agents.agent import Agent, AgentConfig, OffPolicy, OnPolicy
-from jaxouter.agents.ddpg import DDPGConfig
+from jaxouter.agents.ddpg import DDPGConfig, TD3Config
+from jaxouter.agents.ppo import PPOConfig
+from jaxouter.agents.sac import SACConfig
+from jaxouter.agents.trpo import TRPOConfig
 
 __all__ = ["AGENTS", "Agent", "AgentConfig", "OffPolicy", "OnPolicy", "name_of", "resolve"]
 
-AGENTS: dict[str, type[AgentConfig]] = {"ddpg": DDPGConfig}
+AGENTS: dict[str, type[AgentConfig]] = {
+    "ddpg": DDPGConfig,
+    "td3": TD3Config,
+    "sac": SACConfig,
+    "ppo": PPOConfig,
+    "trpo": TRPOConfig,
+}
 """The settings class of each learner, by name."""
 
 

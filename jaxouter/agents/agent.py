@@ -90,15 +90,19 @@ class OnPolicy:
     """Discount per control step."""
     gae_lambda: float
     """Lambda of generalised advantage estimation (Schulman et al. 2016); 1: the whole return."""
+    hold: bool = False
+    """Where the set-point moves the return ends, with the value that it would have gone on with had it stayed."""
+    prefill: int = 0
+    """Environment steps before the first update, from which observations are whitened."""
 
     @property
     def before(self) -> int:
         """Environment steps before the first epoch."""
-        return 0
+        return self.prefill
 
     def total_updates(self, steps: int, environments: int) -> int:
-        """Updates in `steps` environment steps."""
-        return steps // (self.unroll * environments) * self.epochs * self.minibatches
+        """Updates in `steps` environment steps, of which the first `prefill` have none."""
+        return max(0, steps - self.prefill) // (self.unroll * environments) * self.epochs * self.minibatches
 
     def check(self, steps: int, epoch: int, environments: int, shards: int) -> None:
         """Check that these settings fit together.
@@ -107,7 +111,9 @@ class OnPolicy:
             ValueError: names the field, its value and what is allowed.
         """
         each = self.unroll * environments
-        for name, value in (("epoch", epoch), ("steps", steps)):
+        _multiple("agent.prefill", self.prefill, environments, f"the {environments} environments")
+        learned = "steps minus agent.prefill" if self.prefill else "steps"
+        for name, value in (("epoch", epoch), (learned, steps - self.prefill if steps else 0)):
             _multiple(name, value, each, f"{each}: agent.unroll = {self.unroll} steps of {environments} environments")
         _multiple("agent.unroll times environments", each // shards, self.minibatches, "agent.minibatches")
 
@@ -216,18 +222,18 @@ class Agent(Protocol):
 
 
 class OffPolicyAgent(Agent, Protocol):
-    """What the off-policy driver and the live loop need in addition."""
+    """What the off-policy driver needs in addition."""
 
     def diagnose(self, state: Any, batch: Transitions, key: chex.PRNGKey) -> dict[str, jax.Array]:
         """Diagnostics on one batch, such as gradient norms."""
         ...
 
-    def endless(self, warm_up: int) -> OffPolicyAgent:
-        """The same learner for a loop without end; its actor is frozen for the first `warm_up` updates."""
-        ...
 
-    def prepared(self, state: Any, obs: jax.Array) -> Any:
-        """The state before the first update, given the observations of the prefill (N, n). The policy is the same."""
+class LiveAgent(OffPolicyAgent, Protocol):
+    """What the live loop needs in addition."""
+
+    def endless(self, warm_up: int) -> LiveAgent:
+        """The same learner for a loop without end; its actor is frozen for the first `warm_up` updates."""
         ...
 
     def restarted(self, state: Any) -> Any:

@@ -17,7 +17,8 @@ from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
 from jaxouter.agents.networks import Actor, Critic, QuadraticCritic
 from jaxouter.agents.noise import ornstein_uhlenbeck
-from jaxouter.agents.whitening import Whitening
+from jaxouter.agents.updates import RateDecay, of_batch, scheduled, where
+from jaxouter.agents.whitening import Whitened, whitened
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class DDPGConfig(AgentConfig):
     """Learning rate of the actor (Adam)."""
     critic_rate: float = 1e-3
     """Learning rate of the critic (Adam)."""
-    rate_decay: Literal["constant", "cosine"] = "constant"
+    rate_decay: RateDecay = "constant"
     """Schedule of both learning rates over the training; cosine ends at zero."""
     critic_l2: float = 1e-2
     """L2 penalty on the critic's weights: half this times their squared norm is added to the loss."""
@@ -84,9 +85,9 @@ class DDPGConfig(AgentConfig):
         """Transitions from a replay."""
         return OffPolicy(**{name: getattr(self, name) for name in OffPolicy.__dataclass_fields__})
 
-    def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> DDPG:
+    def build(self, obs_size: int, total_updates: int = 1, axis: str | None = None) -> DDPG | Whitened:
         """The learner."""
-        return DDPG(self, obs_size, total_updates=total_updates, axis=axis)
+        return whitened(DDPG(self, obs_size, total_updates=total_updates, axis=axis), self.whiten)
 
     def check(self) -> None:
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
@@ -127,6 +128,21 @@ class DDPGConfig(AgentConfig):
             raise ValueError(f"agent.hidden is {self.hidden}; it must be at least two positive widths")
 
 
+@dataclass(frozen=True)
+class TD3Config(DDPGConfig):
+    """Settings of DDPG with TD3's three tricks on.
+
+    Source: Fujimoto et al., Addressing function approximation error in actor-critic methods, 2018.
+    """
+
+    critics: Literal[1, 2] = 2
+    """With two critics, the target takes the smaller value."""
+    policy_delay: int = 2
+    """Critic updates per update of the actor and the targets."""
+    target_noise: float = 0.2
+    """Standard deviation of the noise on the target action."""
+
+
 class Noise(NamedTuple):
     """State of the exploration noise, of one environment or of all."""
 
@@ -144,7 +160,6 @@ class DDPGState(NamedTuple):
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
     updates: jax.Array  # int32
-    white: Any = ()  # the `Whitening` on which the networks learn, if any
 
 
 def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.Array:
@@ -155,11 +170,6 @@ def td_target(reward: jax.Array, discount: jax.Array, next_q: jax.Array) -> jax.
         next_q: (critics,).
     """
     return reward + discount * jnp.min(next_q)
-
-
-def where(condition: jax.Array, tree: Any, other: Any) -> Any:
-    """`tree` if the condition holds, else `other`, leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree, other)
 
 
 @dataclass(frozen=True)
@@ -190,15 +200,8 @@ class DDPG:
         hidden = self.config.hidden
         return QuadraticCritic(hidden) if self.config.critic == "quadratic" else Critic(hidden, self.config.layer_norm)
 
-    def _average(self, found: tuple[jax.Array, Any]) -> tuple[jax.Array, Any, jax.Array]:
-        """Loss (0 if not finite) and gradient, averaged over all parts of the batch, and whether the loss is finite."""
-        loss, gradient = found if self.axis is None else jax.lax.pmean(found, self.axis)
-        finite = jnp.isfinite(loss)
-        return jnp.where(finite, loss, 0.0), gradient, finite
-
     def _rate(self, rate: float) -> float | optax.Schedule:
-        decays = self.config.rate_decay == "cosine"
-        return optax.cosine_decay_schedule(rate, max(1, self.total_updates)) if decays else rate
+        return scheduled(rate, self.config.rate_decay, self.total_updates)
 
     @property
     def actor_optimiser(self) -> optax.GradientTransformation:
@@ -226,9 +229,9 @@ class DDPG:
         obs, action = jnp.zeros(self.obs_size), jnp.zeros(self.action_size)
         actor = self.network.init(key_actor, obs)
         critics = tuple(self.critic.init(k, obs, action) for k in key_critics)
-        return self._begin(actor, critics, Whitening.none(self.obs_size) if self.config.whiten else ())
+        return self._begin(actor, critics)
 
-    def _begin(self, actor: Any, critics: tuple[Any, ...], white: Any) -> DDPGState:
+    def _begin(self, actor: Any, critics: tuple[Any, ...]) -> DDPGState:
         """These networks, with fresh targets, optimisers and counters."""
         return DDPGState(
             actor=actor,
@@ -238,27 +241,18 @@ class DDPG:
             actor_optimiser=self.actor_optimiser.init(actor),
             critic_optimiser=self.critic_optimiser.init(critics),
             updates=jnp.zeros((), jnp.int32),
-            white=white,
         )
-
-    def prepared(self, state: DDPGState, obs: jax.Array) -> DDPGState:
-        """The same policy, which will learn on observations that are whitened as these (N, n), if so configured."""
-        if not self.config.whiten:
-            return state
-        obs = obs if self.axis is None else jax.lax.all_gather(obs, self.axis, tiled=True)
-        return self.with_actor(state._replace(white=Whitening.of(obs, self.config.whiten)), self.actor(state))
 
     def restarted(self, state: DDPGState) -> DDPGState:
         """The same networks, with fresh targets, optimisers and counters."""
-        return self._begin(state.actor, state.critics, state.white)
+        return self._begin(state.actor, state.critics)
 
     def actor(self, state: DDPGState) -> Any:
-        """Parameters of the actor network, on plain observations."""
-        return state.white.folded(state.actor) if self.config.whiten else state.actor
+        """Parameters of the actor network."""
+        return state.actor
 
     def with_actor(self, state: DDPGState, actor: Any) -> DDPGState:
         """The state with another actor; its target network is replaced too."""
-        actor = state.white.unfolded(actor) if self.config.whiten else actor
         return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
 
     def endless(self, warm_up: int) -> DDPG:
@@ -278,7 +272,7 @@ class DDPG:
         """mu(s) plus Ornstein-Uhlenbeck noise that restarts with each episode; see `Agent.explore`."""
         sigma = noise.sigma * (1.0 + (self.config.noise_end - 1.0) * progress)
         x = ornstein_uhlenbeck(jnp.where(first, 0.0, noise.x), normal[0], self.config.noise_theta, sigma)
-        return jnp.clip(self.act(state.actor, self._seen(state, obs)) + x[None], -1.0, 1.0), noise._replace(x=x), ()
+        return jnp.clip(self.act(state.actor, obs) + x[None], -1.0, 1.0), noise._replace(x=x), ()
 
     def act(self, actor: Any, obs: jax.Array) -> jax.Array:
         """mu(s): obs (..., n) -> action (..., m) in [-1, 1]."""
@@ -290,12 +284,7 @@ class DDPG:
 
     def value(self, state: DDPGState, obs: jax.Array) -> jax.Array:
         """Q(s, mu(s)) of the first critic: obs (..., n) -> (...)."""
-        obs = self._seen(state, obs)
         return cast(jax.Array, self.critic.apply(state.critics[0], obs, self.act(state.actor, obs)))
-
-    def _seen(self, state: DDPGState, obs: jax.Array) -> jax.Array:
-        """Observations as the networks take them: (..., n) -> (..., n)."""
-        return state.white(obs) if self.config.whiten else obs
 
     def values(self, critics: tuple[Any, ...], obs: jax.Array, action: jax.Array) -> jax.Array:
         """Q of each critic: (B, n), (B, m) -> (B, critics)."""
@@ -325,7 +314,6 @@ class DDPG:
         """
         cfg = self.config
         chex.assert_rank([batch.obs, batch.action, batch.reward, batch.discount], [2, 2, 1, 1])
-        batch = batch._replace(obs=self._seen(state, batch.obs), next_obs=self._seen(state, batch.next_obs))
         next_action = self.act(state.target_actor, batch.next_obs)
         if cfg.target_noise > 0:
             noise = cfg.target_noise * jax.random.normal(key, next_action.shape, next_action.dtype)
@@ -339,7 +327,7 @@ class DDPG:
             return jnp.mean(jnp.sum((target[:, None] - q) ** 2, -1)), jnp.mean(q)
 
         (critic_value, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
-        critic_value, gradient, critic_finite = self._average((critic_value, gradient))
+        critic_value, gradient, critic_finite = of_batch((critic_value, gradient), self.axis)
         of_critics = optax.tree.norm(gradient) if norms else None
         before = state.critics, state.critic_optimiser
         critics, critic_optimiser = where(
@@ -356,7 +344,7 @@ class DDPG:
                 return loss, jnp.mean(jnp.where(jnp.abs(action) > 0.99, 1.0, 0.0))
 
             (loss, saturation), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
-            loss, gradient, finite = self._average((loss, gradient))
+            loss, gradient, finite = of_batch((loss, gradient), self.axis)
             finite &= critic_finite
             actor, optimiser = descend(self.actor_optimiser, gradient, state.actor_optimiser, state.actor)
             moved = state._replace(

@@ -61,6 +61,20 @@ class QuadraticCritic(nn.Module):
         return value[..., 0] - jnp.sum(0.1 * nn.softplus(curvature) * (10.0 * action - middle) ** 2, -1)
 
 
+class Value(nn.Module):
+    """V(s)."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        """Obs (..., n) -> V (...)."""
+        x = obs
+        for features in self.hidden:
+            x = nn.silu(dense(features, x.shape[-1])(x))
+        return dense(1, x.shape[-1], 3e-3)(x)[..., 0]
+
+
 class AdvantageCritic(nn.Module):
     """Gain of a change d of the policy's action, g(s) d - softplus(p(s)) d^2: zero at no change, and concave."""
 

@@ -6,8 +6,9 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,7 @@ from jaxouter.training.epochs import NotFiniteError, Pace, Report, Row, train
 from jaxouter.training.policy import LearnedParams
 from jaxouter.training.pretraining import PretrainingState
 from jaxouter.training.resources import arithmetic, resources
-from jaxouter.training.run import FORMAT, RunFolder, add_agent, lock, write_json
+from jaxouter.training.run import FORMAT, RUNS, RunFolder, add_agent, lock, write_json
 from jaxouter.training.trainer import Trainer
 
 LOOK_SECONDS = 5.0  # least time between two evaluations of the MAE during pretraining
@@ -157,9 +158,53 @@ def configured(
         )
     of_plant = {key: flat.pop(key) for key in list(flat) if key in PlantOptions.__dataclass_fields__}
     options = PlantOptions(**of_plant)
-    name = implied(name, flat.get("base", "lq"))
+    name = implied(name, flat.get("base", "lq"), known_agent)
     default = preset(add(plant, options, parameters), name, known_agent)
     return from_dict(to_dict(with_options(default, {**flat, "plant_options": options})))  # which looks at types too
+
+
+def learners(
+    plant: str | Maker,
+    agents: Sequence[str],
+    seeds: int = 1,
+    steps: int | None = None,
+    set: Mapping[str, Any] | None = None,
+    progress: bool | Progress = True,
+) -> list[Run]:
+    """Runs of several agents with the preset `scratch`: those in runs/PLANT-scratch-AGENT, else trained there.
+
+    Args:
+        plant: as for `learn`.
+        agents: names, or FILE.py:CLASS.
+        seeds: of each agent, from 0.
+        steps: environment steps of each; what is left of whole unrolls is not used; None: the preset's.
+        set, progress: as for `learn`.
+
+    Raises:
+        ValueError: something named does not exist, a setting is wrong, or a folder holds another or an unfinished run.
+        Stopped, OSError, NotFiniteError: as for `learn`.
+    """
+    with own_errors():
+        name = add(plant, parameters=set)
+        configs = {agent: preset(name, "scratch", add_agent(agent)) for agent in agents}
+    found = []
+    for agent, config in configs.items():
+        data, wanted = config.agent.data, config.steps if steps is None else steps
+        each = config.environments * getattr(data, "unroll", 1)
+        whole = data.before + max(1, (wanted - data.before) // each) * each
+        config = replace(config, seeds=seeds, steps=whole)
+        path = RUNS / f"{slug(config.plant)}-scratch-{agent.rpartition(':')[2]}"
+        if not path.exists():
+            found.append(training(config, path, progress=progress))
+            continue
+        run = RunFolder.open(path)
+        as_chosen = {field: getattr(run.config, field) for field in ("history", "explored_steps", "pretraining")}
+        if replace(config, **as_chosen) != run.config:
+            raise ValueError(f"{path} holds a run with other settings, steps or seeds; move it elsewhere")
+        if not (path / "summary.json").exists():
+            raise ValueError(f"{path} is not finished; {go_on(run)}")
+        found.append(Run(run))
+    return found
 
 
 def training(

@@ -150,6 +150,11 @@ class Observer:
             r_next=jnp.where(later, r, window.r_next),
         )
 
+    def had_r_been(self, obs: jax.Array, more: jax.Array) -> jax.Array:
+        """The observation (..., n) if the present reference were larger by `more` (...), and all before as it was."""
+        of_each = jnp.asarray([1.0, 1.0, 1.0 / self.integral_steps], obs.dtype) / self.y_scale
+        return obs.at[..., :3].add(jnp.multiply.outer(more, of_each))
+
     def before_and_after(self, window: Signals, i: jax.Array | int, j: jax.Array | int) -> tuple[jax.Array, jax.Array]:
         """Observations at t_i and at t_(j+1), j >= i, the latter before any reset; each (3 + 2H,)."""
         at_i = self.features(self.memory_at(window, i), window.r[i], window.y[i])

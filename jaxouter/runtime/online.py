@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxouter.agents import AgentConfig, OffPolicy, noise
-from jaxouter.agents.agent import OffPolicyAgent
+from jaxouter.agents.agent import LiveAgent
 from jaxouter.agents.replay import Replay, ReplayState
 from jaxouter.identification import linear_models, lq
 from jaxouter.identification.records import Record
@@ -115,7 +115,7 @@ class Live:
 
     env: Environment  # declares the plant; never stepped
     policy: LearnedPolicy
-    agent: OffPolicyAgent
+    agent: LiveAgent
     data: OffPolicy
     reward_scale: float
     replay: Replay
@@ -139,7 +139,7 @@ class Live:
         chosen = config.agent
         if not isinstance(chosen.data, OffPolicy):
             chosen = cast(AgentConfig, replace(cast(Any, preset(config.plant).agent), hidden=chosen.hidden))
-        agent = cast(OffPolicyAgent, chosen.build(env.observer.size)).endless(takeover // 2)
+        agent = cast(LiveAgent, chosen.build(env.observer.size)).endless(takeover // 2)
         low, high = env.plant.r_tilde_bounds
         policy = LearnedPolicy(env.observer, chosen.hidden, config.correction * (high - low) / 2)
         replay = Replay(FIELDS, 1 + COMPARED + EXPLORING, KEPT, env.observer.history)

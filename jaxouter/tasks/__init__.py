@@ -7,7 +7,7 @@ import inspect
 from jaxouter import plants
 from jaxouter.tasks.heaters import HEATERS
 from jaxouter.tasks.pitch import PITCH
-from jaxouter.tasks.presets import PRESETS
+from jaxouter.tasks.presets import LEARNERS, PRESETS
 from jaxouter.tasks.task import Axis, Families, Options, Scenario, Sweep, Task
 
 __all__ = ["TASKS", "Axis", "Families", "Scenario", "Sweep", "Task", "of", "options", "presets"]
@@ -33,12 +33,13 @@ def presets(plant: str) -> list[str]:
     return list(dict.fromkeys([*of(plant).presets, *PRESETS]))
 
 
-def options(plant: str, preset: str) -> Options:
-    """The options of a preset.
+def options(plant: str, preset: str, agent: str | None = None) -> Options:
+    """The options of a preset, with an agent's own where it is `scratch`.
 
     Raises:
         ValueError: unknown plant or preset; lists the known ones.
     """
     if preset not in presets(plant):
         raise ValueError(f"there is no preset {preset!r} for {plant}; the presets are: {', '.join(presets(plant))}")
-    return {**PRESETS.get(preset, PRESETS["default"]), **of(plant).presets.get(preset, {})}
+    of_agent = LEARNERS.get(agent or "", {}) if preset == "scratch" else {}
+    return {**PRESETS.get(preset, PRESETS["default"]), **of_agent, **of(plant).presets.get(preset, {})}

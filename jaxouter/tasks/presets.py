@@ -62,6 +62,25 @@ SCRATCH: Options = {
     "pairs.noise_sigma": (0.005, 0.03),
 }
 PRESETS: Mapping[str, Options] = {"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "paper": PAPER}
+OFF_POLICY: Options = {"pairs.rounds": 0, "steps": 665_600, "agent.updates": 6}
+ON_POLICY: Options = {
+    "pairs.rounds": 0,
+    "environments": 64,
+    "epoch": 64_000,
+    "steps": 5_132_800,
+    "agent.unroll": 50,
+    "agent.prefill": 12_800,
+    "agent.whiten": 0.2,
+    "agent.hold": True,
+    "agent.hidden": (64, 64),
+}
+LEARNERS: Mapping[str, Options] = {
+    "td3": {**OFF_POLICY, "agent.target_noise": 0.02, "agent.target_noise_clip": 0.05},
+    "sac": {**OFF_POLICY, "agent.temperature": 1e-3, "agent.target_entropy": -2.5, "agent.sigma": 0.02},
+    "ppo": {**ON_POLICY, "agent.sigma": 0.03},
+    "trpo": {**ON_POLICY, "agent.sigma": 0.03},
+}
+"""What `scratch` has otherwise with other agents than its own: they learn without pairs."""
 LIVE: Options = {  # an unknown plant in real time: an update must fit into milliseconds
     **RECORD,
     "agent.hidden": (64, 64),
@@ -70,6 +89,6 @@ LIVE: Options = {  # an unknown plant in real time: an update must fit into mill
 }
 
 
-def implied(preset: str, base: str) -> str:
-    """The preset that a choice of the base law implies: without the LQ law `default` is `scratch`."""
-    return "scratch" if preset == "default" and base != "lq" else preset
+def implied(preset: str, base: str, agent: str | None = None) -> str:
+    """The preset that a choice of base law or agent implies: `default` is `scratch` without the LQ law or DDPG."""
+    return "scratch" if preset == "default" and (base != "lq" or agent not in (None, DEFAULT["agent"])) else preset

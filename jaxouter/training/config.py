@@ -286,23 +286,28 @@ def preset(plant: str, name: str = "default", agent: str | None = None) -> Train
 
     Args:
         plant, name: registered names.
-        agent: None: the preset's; another agent comes with its own defaults.
+        agent: None: the preset's; another one has its own defaults, but for settings that both have.
 
     Raises:
         ValueError: unknown plant, preset or agent; lists the known ones.
     """
-    return configured(plant, name, tasks.options(plant, name), agent)
+    return configured(plant, name, tasks.options(plant, name, agent), agent)
 
 
 def configured(plant: str, name: str, options: tasks.Options, agent: str | None = None) -> TrainConfig:
-    """The configuration from options, which include the agent's name; another `agent` comes with its own defaults."""
+    """The configuration from options, which include the agent's name.
+
+    Another `agent` takes over the settings that it has too.
+    """
     options = dict(options)
     own = options.pop("agent")
     kind = agents.resolve(agent or own)
     settings = {key: value for key, value in options.items() if key.startswith("agent.")}
     rest = {key: value for key, value in options.items() if key not in settings}
+    if agent not in (None, own):
+        settings = {key: value for key, value in settings.items() if hasattr(kind, key.removeprefix("agent."))}
     try:
-        base = TrainConfig(plant, name, _changed(kind(), settings if agent in (None, own) else {}, "agent."))
+        base = TrainConfig(plant, name, _changed(kind(), settings, "agent."))
         return from_dict(to_dict(_changed(base, rest, "")))  # which looks at types too
     except ValueError as error:
         raise ValueError(f"preset {name!r} of {plant}: {error}") from None

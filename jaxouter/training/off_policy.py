@@ -13,6 +13,7 @@ import numpy as np
 from jaxouter.agents.agent import OffPolicy, OffPolicyAgent, Transitions
 from jaxouter.agents.replay import Replay, ReplayState
 from jaxouter.agents.returns import n_step_return
+from jaxouter.agents.whitening import prepared
 from jaxouter.loop import rewards
 from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import EnvParams
@@ -141,7 +142,7 @@ class OffPolicyDriver:
             return after._replace(data=self.replay.write(after.data, self.row(taken))), state.obs
 
         state, obs = jax.lax.scan(step, state, (actions, every.each(keys_env)))
-        return state._replace(agent=self.agent.prepared(state.agent, obs.reshape(-1, obs.shape[-1])))
+        return state._replace(agent=prepared(self.agent, state.agent, obs))
 
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Explore and learn for `steps` environment steps (over all environments of all shards).

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from jaxouter.agents.agent import Agent, Experience, OnPolicy
 from jaxouter.agents.returns import generalised_advantage
+from jaxouter.agents.whitening import prepared
 from jaxouter.loop.environment import EnvParams
-from jaxouter.training.environments import AXIS, Environments, TrainState
+from jaxouter.training.environments import AXIS, Environments, Step, TrainState
 from jaxouter.training.off_policy import step_metrics
 
 
@@ -49,9 +50,12 @@ class OnPolicyDriver:
         return Experience(of(state.obs), action, jax.tree.map(of, extras), scalar, scalar)
 
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
-        """Does nothing: an on-policy learner learns only from its own actions."""
-        del params
-        return state
+        """Explore without learning, for the observations alone."""
+        steps = self.data.prefill // self.environments.total
+        if not steps:
+            return state
+        state, (obs, *_) = self._explore(state, params, *self.environments.keys(state, steps, 2))
+        return state._replace(agent=prepared(self.agent, state.agent, obs))
 
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
         """Explore and learn for `steps` environment steps (over all environments of all shards), in whole unrolls.
@@ -67,10 +71,11 @@ class OnPolicyDriver:
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics if self.environments.shards == 1 else jax.lax.pmean(metrics, AXIS)
 
-    def _iteration(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
-        """One unroll, and the updates from it."""
-        every, data = self.environments, self.data
-        keys_noise, keys_env, keys_update = every.keys(state, data.unroll, 3)
+    def _explore(
+        self, state: TrainState, params: EnvParams, keys_noise: chex.PRNGKey, keys_env: chex.PRNGKey
+    ) -> tuple[TrainState, tuple[jax.Array, Any, Step, dict[str, jax.Array]]]:
+        """Steps of every environment: the state; observations, extras, steps and metrics, each (steps, ...)."""
+        every = self.environments
 
         def step(state: TrainState, xs: tuple[jax.Array, chex.PRNGKey]) -> tuple[TrainState, Any]:
             obs = state.obs
@@ -78,12 +83,20 @@ class OnPolicyDriver:
             state, taken = every.step(state, params, action, xs[1])
             return state._replace(noise=noise), (obs, extras, taken, step_metrics(taken, finite))
 
-        state, (obs, extras, taken, metrics) = jax.lax.scan(
-            step, state, (every.normals(keys_noise), every.each(keys_env))
-        )
-        value, next_value = (self.agent.value(state.agent, each) for each in (obs, taken.final_obs))
+        return jax.lax.scan(step, state, (every.normals(keys_noise), every.each(keys_env)))
+
+    def _iteration(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One unroll, and the updates from it."""
+        every, data = self.environments, self.data
+        *keys, keys_update = every.keys(state, data.unroll, 3)
+        state, (obs, extras, taken, metrics) = self._explore(state, params, *keys)
+        final_obs, ended = taken.final_obs, taken.terminated | taken.truncated
+        if data.hold:
+            moved = taken.signals.r_next - taken.signals.r
+            final_obs, ended = every.env.observer.had_r_been(final_obs, -moved), ended | (moved != 0.0)
+        value, next_value = (self.agent.value(state.agent, each) for each in (obs, final_obs))
         advantage = jax.vmap(partial(generalised_advantage, discount=data.discount, gae_lambda=data.gae_lambda), 1, 1)(
-            taken.reward, value, next_value, taken.terminated, taken.terminated | taken.truncated
+            taken.reward, value, next_value, taken.terminated, ended
         )
         experience = Experience(obs, taken.action[..., None], extras, advantage, advantage + value)
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), experience)

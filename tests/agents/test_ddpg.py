@@ -8,7 +8,9 @@ import pytest
 
 from jaxouter.agents.agent import Transitions
 from jaxouter.agents.ddpg import DDPG, DDPGConfig, td_target
+from jaxouter.agents.networks import act
 from jaxouter.agents.returns import n_step_return
+from jaxouter.agents.whitening import prepared
 
 SMALL = DDPGConfig(hidden=(16, 16), batch_size=8, actor_rate=1e-3, critic_l2=0.0)
 
@@ -254,36 +256,38 @@ def alike(seed: int, size: int) -> jax.Array:
 
 
 def test_whitening_leaves_the_policy_as_it_is():
-    ddpg = DDPG(replace(SMALL, whiten=1e-2), 3)
+    ddpg = replace(SMALL, whiten=1e-2).build(3)
     before, obs = ddpg.init(jax.random.key(0)), alike(1, 500)
     state = ddpg.prepared(before, obs)
     np.testing.assert_allclose(np.cov(state.white(obs).T), np.eye(3), atol=0.1)
-    expected = ddpg.act(ddpg.actor(before), obs)
-    np.testing.assert_allclose(ddpg.act(ddpg.actor(state), obs), expected, atol=1e-5)
+    expected = act(SMALL.hidden, ddpg.actor(before), obs)
+    np.testing.assert_allclose(act(SMALL.hidden, ddpg.actor(state), obs), expected, atol=1e-5)
     action, *_ = ddpg.explore(state, ddpg.noise(1)._replace(x=0.0, sigma=0.0), obs[0], jnp.zeros(1), False, 0.0)
     np.testing.assert_allclose(action, expected[0], atol=1e-5)
     again = ddpg.with_actor(state, ddpg.actor(state))
-    chex.assert_trees_all_close(again.actor, state.actor, atol=1e-4)
+    chex.assert_trees_all_close(again.learner.actor, state.learner.actor, atol=1e-4)
 
 
 def test_a_whitened_learner_learns_what_a_plain_one_learns_on_whitened_observations():
-    whitened, plain = DDPG(replace(SMALL, whiten=1e-2), 3), DDPG(SMALL, 3)
+    whitened, plain = replace(SMALL, whiten=1e-2).build(3), DDPG(SMALL, 3)
     batch = random_batch(3)._replace(obs=alike(4, 8), next_obs=alike(5, 8))
     state = whitened.prepared(whitened.init(jax.random.key(0)), alike(1, 500))
-    white, other = state.white, state._replace(white=())
+    white, other = state.white, state.learner
     of_plain = batch._replace(obs=white(batch.obs), next_obs=white(batch.next_obs))
     update, of_other = jax.jit(whitened.update), jax.jit(plain.update)
     for _ in range(3):
         state, metrics = update(state, batch, jax.random.key(2))
         other, expected = of_other(other, of_plain, jax.random.key(2))
         chex.assert_trees_all_close(metrics, expected, rtol=1e-5)
-    chex.assert_trees_all_close(state._replace(white=()), other, rtol=1e-5)
+    chex.assert_trees_all_close(state.learner, other, rtol=1e-5)
     obs = alike(6, 20)
-    np.testing.assert_allclose(whitened.act(whitened.actor(state), obs), plain.act(other.actor, white(obs)), atol=1e-5)
+    found = act(SMALL.hidden, whitened.actor(state), obs)
+    np.testing.assert_allclose(found, plain.act(other.actor, white(obs)), atol=1e-5)
     np.testing.assert_allclose(whitened.value(state, obs), plain.value(other, white(obs)), atol=1e-5)
 
 
 def test_without_whitening_nothing_is_prepared():
-    ddpg = DDPG(SMALL, 3)
+    ddpg = SMALL.build(3)
+    assert isinstance(ddpg, DDPG)
     state = ddpg.init(jax.random.key(0))
-    assert ddpg.prepared(state, jnp.ones((5, 3))) is state
+    assert prepared(ddpg, state, jnp.ones((5, 3))) is state

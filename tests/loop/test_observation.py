@@ -54,6 +54,15 @@ def test_later_observations_are_as_computed_by_hand() -> None:
     chex.assert_trees_all_close(third, jnp.array([-1.0, -1.2, -0.075, -0.4, -0.6, -0.6, -1.0, 0.5, -0.1]), atol=1e-6)
 
 
+def test_an_observation_had_r_been_another_is_that_of_the_other() -> None:
+    memory, _ = OBSERVER.observe(OBSERVER.init(scalar(22.0), scalar(18.0)), scalar(22.0), scalar(18.0))
+    memory = OBSERVER.record(memory, scalar(18.0), scalar(30.0))
+    here, there = (OBSERVER.observe(memory, scalar(r), scalar(19.0))[1] for r in (22.0, 16.5))
+    chex.assert_trees_all_close(OBSERVER.had_r_been(here, scalar(-5.5)), there, atol=1e-6)
+    batch = OBSERVER.had_r_been(jnp.stack([here, here]), jnp.array([0.0, -5.5]))
+    chex.assert_trees_all_close(batch, jnp.stack([here, there]), atol=1e-6)
+
+
 def test_integral_settles_at_a_constant_error() -> None:
     memory = OBSERVER.init(scalar(22.0), scalar(20.0))
     for _ in range(60):
