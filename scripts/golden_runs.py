@@ -1,7 +1,7 @@
 """Golden run folders: a small run of each preset of both plants, in tests/runs, which every later version must load.
 
     python scripts/golden_runs.py            # compares what their policies do with tests/runs/r_tilde.json
-    python scripts/golden_runs.py --write    # makes them anew, with the version of this checkout
+    python scripts/golden_runs.py --write    # makes them anew, with the version of this checkout; --only NAME ...: some
 
 Make them anew only if the format of run folders changes on purpose; see CONTRIBUTING.md. They are made from the presets
 with fewer steps and smaller networks, and evaluated on one episode of each scenario. Figures are not kept.
@@ -95,12 +95,15 @@ def made(plant: str, preset: str) -> jaxouter.Run:
     return run
 
 
-def main(write: bool = False) -> None:
-    """Compare the policies of the golden runs with what they did, or make the runs anew."""
+def main(write: bool = False, only: tuple[str, ...] = ()) -> None:
+    """Compare the policies of the golden runs with what they did, or make the runs anew: all, or `only` some."""
     if write:
-        shutil.rmtree(FOLDER, ignore_errors=True)
-        runs = [made(*name) for name in names()]
-        EXPECTED.write_text(json.dumps({run.path.name: acted(run) for run in runs}, indent=1) + "\n")
+        expected = json.loads(EXPECTED.read_text()) if only else {}
+        for name in names():
+            if not only or path(*name).name in only:
+                shutil.rmtree(path(*name), ignore_errors=True)
+                expected[path(*name).name] = acted(made(*name))
+        EXPECTED.write_text(json.dumps(expected, indent=1) + "\n")
     wrong = []
     for run in (jaxouter.load(path(*name)) for name in names()):
         if (far := deviation(run)) > TOLERANCE:

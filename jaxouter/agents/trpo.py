@@ -168,15 +168,14 @@ class TRPO:
         return cast(jax.Array, Value(self.config.hidden).apply(state.critic, obs))
 
     def surrogate(self, policy: GaussianPolicy, batch: Experience) -> jax.Array:
-        """Mean of the ratio of probabilities times the advantage, over all parts of the batch (eq. 14)."""
+        """Mean of the ratio of probabilities times the advantage (eq. 14), over this part of the batch."""
         log_ratio = log_probability(batch.extras.u, mean(self.config.hidden, policy, batch.obs), policy.log_sigma)
-        return averaged(jnp.mean(jnp.exp(log_ratio - batch.extras.log_probability) * batch.advantage), self.axis)
+        return jnp.mean(jnp.exp(log_ratio - batch.extras.log_probability) * batch.advantage)
 
     def divergence(self, policy: GaussianPolicy, other: GaussianPolicy, obs: jax.Array) -> jax.Array:
-        """Mean KL divergence of the other policy from `policy` over all parts of observations (B, n)."""
+        """Mean KL divergence of the other policy from `policy` over observations (B, n)."""
         mus = (mean(self.config.hidden, each, obs) for each in (policy, other))
-        each = divergence(next(mus), policy.log_sigma, next(mus), other.log_sigma)
-        return averaged(jnp.mean(each), self.axis)
+        return jnp.mean(divergence(next(mus), policy.log_sigma, next(mus), other.log_sigma))
 
     def fisher_product(self, policy: GaussianPolicy, obs: jax.Array, vector: jax.Array) -> jax.Array:
         """Fisher matrix over observations (B, n), the Hessian of the divergence (appendix C.1), times a vector (p,)."""
@@ -185,7 +184,7 @@ class TRPO:
         def gradient(flat: jax.Array) -> jax.Array:
             return jax.grad(lambda other: self.divergence(policy, unravel(other), obs))(flat)
 
-        return jax.jvp(gradient, (flat,), (vector,))[1]
+        return averaged(jax.jvp(gradient, (flat,), (vector,))[1], self.axis)
 
     def update(self, state: TRPOState, batch: Experience, key: chex.PRNGKey) -> tuple[TRPOState, dict[str, Any]]:
         """One step of the policy, and as many of the critic as are configured.
@@ -212,7 +211,7 @@ class TRPO:
         def surrogate(flat: jax.Array) -> jax.Array:
             return self.surrogate(unravel(flat), batch)
 
-        before, gradient = jax.value_and_grad(surrogate)(begin)
+        before, gradient = averaged(jax.value_and_grad(surrogate)(begin), self.axis)
         some = batch.obs[:: config.fisher_every]  # the batch is in random order
 
         def damped(vector: jax.Array) -> jax.Array:
@@ -223,8 +222,9 @@ class TRPO:
 
         def attempt(search: Search) -> Search:
             flat = begin + search.share * whole
-            kl = self.divergence(policy, unravel(flat), batch.obs)
-            accepted = (surrogate(flat) > before) & (kl <= config.kl)
+            found = surrogate(flat), self.divergence(policy, unravel(flat), batch.obs)
+            after, kl = averaged(found, self.axis)
+            accepted = (after > before) & (kl <= config.kl)
             share = jnp.where(accepted, search.share, 0.5 * search.share)
             return Search(where(accepted, flat, begin), share, search.tries + 1, accepted, jnp.where(accepted, kl, 0.0))
 
@@ -232,7 +232,7 @@ class TRPO:
         search = Search(begin, zero + 1.0, jnp.zeros((), jnp.int32), jnp.zeros((), bool), zero)
         search = jax.lax.while_loop(lambda s: ~s.accepted & (s.tries <= config.backtracks), attempt, search)
         search = search._replace(share=jnp.where(search.accepted, search.share, 0.0))
-        return unravel(search.policy), search, surrogate(search.policy) - before
+        return unravel(search.policy), search, averaged(surrogate(search.policy), self.axis) - before
 
     def _critic(self, state: TRPOState, batch: Experience, key: chex.PRNGKey) -> tuple[Any, Any, jax.Array]:
         """Critic and optimiser after its updates, and their mean loss."""

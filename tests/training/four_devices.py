@@ -9,6 +9,9 @@ import pytest
 
 from jaxouter import plants
 from jaxouter.agents import AGENTS
+from jaxouter.agents.ppo import PPOConfig
+from jaxouter.agents.sac import SACConfig
+from jaxouter.agents.trpo import TRPOConfig
 from jaxouter.training.config import PretrainingConfig
 from jaxouter.training.devices import Fleet, spread
 from jaxouter.training.epochs import train
@@ -65,10 +68,24 @@ def test_a_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards):
         assert np.all(np.diff(np.std(np.diff(action[:, 80:]), 1)[::2]) > 0)  # the ladder goes on from shard to shard
 
 
-@pytest.mark.parametrize(("seeds", "shards"), [(1, 4), (2, 2)])
-def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, shards, monkeypatch):
+TINY = dict(hidden=(8, 8), hold=True, whiten=0.1)
+ON_POLICY = TINY | dict(unroll=20, epochs=2, minibatches=2, prefill=160)
+
+
+@pytest.mark.parametrize(
+    ("agent", "seeds", "shards"),
+    [
+        (Reinforce(rate=1e-3, sigma=0.1), 1, 4),
+        (Reinforce(rate=1e-3, sigma=0.1), 2, 2),
+        (PPOConfig(**ON_POLICY), 2, 2),
+        (TRPOConfig(**ON_POLICY), 2, 2),
+        (SACConfig(**TINY, batch_size=32, prefill=160, replay=1_600), 2, 2),
+    ],
+)
+def test_a_learner_of_another_kind_is_the_same_on_all_devices_that_it_spans(agent, seeds, shards, monkeypatch):
     monkeypatch.setitem(AGENTS, "reinforce", Reinforce)
-    config = replace(small(seeds=seeds, devices=4, steps=1_280, epoch=640), agent=Reinforce(rate=1e-3, sigma=0.1))
+    steps = 1_280 + agent.data.before
+    config = replace(small(seeds=seeds, devices=4, steps=steps, epoch=640), agent=agent)
     fleet = Fleet.of(config)
     assert fleet.trainer.environments.shards == shards
     trainer, params = RunFolder(None, config).trainer
@@ -76,7 +93,7 @@ def test_an_on_policy_learner_is_the_same_on_all_devices_that_it_spans(seeds, sh
     before = fleet.take(state)
     state, metrics = fleet.epoch(state, params, 640)
     after = fleet.take(state)
-    assert [int(each.steps) for each in after] == [640] * seeds
+    assert [int(each.steps) for each in after] == [640 + agent.data.before] * seeds
     for leaf in jax.tree.leaves((state.agent, metrics)):
         by_seed = {}
         for shard in leaf.addressable_shards:

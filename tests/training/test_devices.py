@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import chex
@@ -14,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxouter.agents.agent import Transitions
+from jaxouter.agents.agent import Experience, Transitions
 from jaxouter.agents.ddpg import DDPG, DDPGConfig
+from jaxouter.agents.ppo import PPO, PPOConfig
+from jaxouter.agents.trpo import TRPO, TRPOConfig
 from jaxouter.train import parse
 from jaxouter.training.devices import Processes
 from jaxouter.training.run import RunFolder
@@ -40,7 +43,7 @@ def test_on_four_forced_devices():
         cwd=HERE.parents[1],
         capture_output=True,
         text=True,
-        timeout=280,
+        timeout=420,
     )
     assert done.returncode == 0, done.stdout
 
@@ -61,6 +64,32 @@ def test_gradients_of_parts_of_a_batch_average_to_that_of_the_whole():
         # Not the weights: the first step of Adam turns rounding of a vanishing gradient into a step.
         chex.assert_trees_all_close(found.critic_optimiser, expected.critic_optimiser, rtol=1e-4, atol=1e-7)
         chex.assert_trees_all_close(found.actor_optimiser, expected.actor_optimiser, rtol=1e-2, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [PPO, TRPO])
+def test_an_on_policy_step_from_parts_of_a_batch_is_that_from_the_whole(kind):
+    config = (PPOConfig if kind is PPO else TRPOConfig)(hidden=(16, 16))
+    config = replace(config, kl=0.0) if kind is PPO else replace(config, fisher_every=1, epochs=1, minibatches=1)
+    whole, parts = kind(config, 3), kind(config, 3, axis="parts")
+    keys = jax.random.split(jax.random.key(0), 4)
+    state, obs = whole.init(keys[0]), jax.random.normal(keys[1], (8, 3))
+    explore = jax.vmap(whole.explore, (None, None, 0, 0, None, None))
+    action, _, sample = explore(state, (), obs, jax.random.normal(keys[2], (8, 1)), False, 0.0)
+    advantage, target = jax.random.normal(keys[3], (2, 8))
+    batch = Experience(obs, action, sample, advantage, target)
+    expected, metrics = jax.jit(whole.update)(state, batch, keys[1])
+    halves = jax.tree.map(lambda leaf: leaf.reshape(2, 4, *leaf.shape[1:]), batch)
+    update = jax.vmap(lambda half: parts.update(state, half, keys[1]), axis_name="parts")
+    found, of_parts = jax.jit(update)(halves)
+    for i in range(2):
+        chex.assert_trees_all_close(jax.tree.map(lambda leaf, i=i: leaf[i], of_parts), metrics, rtol=1e-4, atol=1e-6)
+        policy, critic = (jax.tree.map(lambda leaf, i=i: leaf[i], part) for part in (found.policy, found.critic))
+        if kind is TRPO:
+            chex.assert_trees_all_close(policy, expected.policy, rtol=1e-3, atol=1e-4)
+        else:  # as above: Adam
+            optimiser = jax.tree.map(lambda leaf, i=i: leaf[i], found.policy_optimiser)
+            chex.assert_trees_all_close(optimiser, expected.policy_optimiser, rtol=1e-2, atol=1e-6)
+        chex.assert_trees_all_close(critic, expected.critic, atol=2.1e-3)  # twice its learning rate
 
 
 @pytest.mark.parametrize(
