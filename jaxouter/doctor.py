@@ -34,6 +34,7 @@ EXTRAS = {  # module: extra, and what needs it
     "onnx": ("onnx", "export --format onnx"),
     "pyarrow": ("parquet", "plants log:FILE.parquet"),
     "tensorboardX": ("tensorboard", "train --tensorboard"),
+    "wandb": ("wandb", "train --wandb"),
 }
 SLOW = ("JAX_DISABLE_JIT", "JAX_ENABLE_X64", "JAX_DEBUG_NANS", "XLA_FLAGS")  # variables by which all may be slower
 

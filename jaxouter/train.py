@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 
 from jaxouter import cli, plants
-from jaxouter.api.learning import MAIN_FIGURE, Stopped, chosen, training
+from jaxouter.api.learning import MAIN_FIGURE, Stopped, chosen, following, training
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.cache import use_compilation_cache
 from jaxouter.evaluation.metrics import FiguresOfMerit, number
@@ -59,7 +59,8 @@ class Options:
     """New folder for the run; default: runs/PLANT-PRESET-SEED."""
     resume: Path | None = None
     """Resume the run in this folder; name a plant or agent of your own again. Another --devices may change results.
-    Also allowed: --episodes, --tensorboard, --dry-run, --debug, --coordinator, --num-processes, --process-id."""
+    Also allowed: --episodes, --tensorboard, --wandb, --dry-run, --debug, --coordinator, --num-processes,
+    --process-id."""
     coordinator: str | None = None
     """HOST:PORT of process 0, if there are several processes; --devices then counts those of all processes.
     In a SLURM step of several tasks or an indexed Kubernetes job (with `jax[k8s]`), JAX finds this and the next two."""
@@ -72,6 +73,9 @@ class Options:
     On a plant outside JAX (gym:, fmu:) the default is as many as take no longer than the training."""
     tensorboard: bool = False
     """Also write the metrics as TensorBoard events; needs the extra `tensorboard`."""
+    wandb: bool = False
+    """Also write the metrics for Weights & Biases, into the run folder, or to the server if WANDB_API_KEY is set; needs
+    the extra `wandb`."""
     dry_run: bool = False
     """Print configuration, shapes, memory and arithmetic, and exit before any training."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -100,7 +104,7 @@ def parse(arguments: list[str]) -> Options:
     if options.resume is not None:
         execution = {
             name: getattr(options, name)
-            for name in ("agent", "resume", "dry_run", "tensorboard", "debug", "episodes", *PROCESSES)
+            for name in ("agent", "resume", "dry_run", "tensorboard", "wandb", "debug", "episodes", *PROCESSES)
         }
         config = dataclasses.replace(
             preset(plant, agent=agent), devices=options.config.devices, plant_options=options.config.plant_options
@@ -108,8 +112,8 @@ def parse(arguments: list[str]) -> Options:
         if options != dataclasses.replace(first, config=config, **execution):
             raise ValueError(
                 "--resume takes no other options than your own plant or agent, --devices, --coordinator, "
-                "--num-processes, --process-id, --episodes, --tensorboard, --dry-run and --debug; the run folder holds "
-                "the rest"
+                "--num-processes, --process-id, --episodes, --tensorboard, --wandb, --dry-run and --debug; the run "
+                "folder holds the rest"
             )
         run = RunFolder.open(options.resume).config
         if plant not in (plants.base(run.plant), run.plant, first.config.plant):
@@ -136,7 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
                 options.out,
                 resumes=options.resume,
                 episodes=options.episodes,
-                events=options.tensorboard,
+                follow=following(options.tensorboard, options.wandb),
                 processes=Processes(options.coordinator, options.num_processes, options.process_id),
             )
         except (OSError, NotFiniteError) as error:

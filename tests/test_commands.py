@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tensorboardX.proto import event_pb2
+from wandb.proto import wandb_internal_pb2
 
 from jaxouter import evaluate, train
 from jaxouter.api import learning
@@ -57,7 +59,7 @@ def test_train_writes_the_run_folder(trained):
         assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
     drawn = ["paper", "learning-curve", *(name.replace("/", "-") for name in PLACES)]
-    assert names == {f"{name}.{kind}" for name in drawn for kind in ("png", "svg")}
+    assert names == {f"{name}.{kind}" for name in drawn for kind in ("png", "svg")} | {"episode.webp"}
     summary = json.loads((folder / "summary.json").read_text())
     assert [(r["policy"], r.get("seed")) for r in summary["results"]] == [
         ("learned", 3), ("learned", 4), ("none", None), ("static", None)
@@ -246,15 +248,34 @@ def test_ctrl_c_saves_says_how_to_go_on_and_ends_with_130(tmp_path):
     assert max(metrics.parent.glob("checkpoint-*.npz")).stem == f"checkpoint-{len(rows):06d}"
 
 
+def logged(path: Path) -> tuple[str, list[dict[str, float]]]:
+    """Name and rows of a run of Weights & Biases: records in parts, headers of seven bytes, blocks of 32 KiB."""
+    content, at, data, name, rows = path.read_bytes(), 7, b"", "", []
+    while at < len(content):
+        if at % 32_768 > 32_768 - 7:
+            at += -at % 32_768
+        size, kind = struct.unpack_from("<HB", content, at + 4)
+        data, at = data + content[at + 7 : at + 7 + size], at + 7 + size
+        if kind not in (1, 4):  # whole, or the last part
+            continue
+        record, data = wandb_internal_pb2.Record.FromString(data), b""
+        name = record.run.display_name or name
+        items = {(item.key or item.nested_key[0]): json.loads(item.value_json) for item in record.history.item}
+        rows += [{key: value for key, value in items.items() if not key.startswith("_")}] if items else []
+    return name, rows
+
+
 @pytest.mark.slow
-def test_metrics_are_tensorboard_events_too(trained):
+def test_metrics_go_to_tensorboard_and_wandb_too(trained):
     """Also those of rows that were there before; of each value the row's, once."""
     _, folder = trained
     shutil.copytree(folder, folder.parent / "events")
     run = RunFolder.open(folder.parent / "events")
     for seed in run.seeds:
         run.forget(seed, 0)  # all epochs run again
-    train.main(["--resume", str(run.path), "--tensorboard"])
+    train.main(["--resume", str(run.path), "--tensorboard", "--wandb"])
+    runs = {name: rows for path in run.path.glob("wandb/offline-run-*/*.wandb") for name, rows in [logged(path)]}
+    assert runs == {f"events, seed {seed}": run.rows(seed) for seed in run.seeds}
     for seed in run.seeds:
         (path,) = run.seed_folder(seed).glob("events.out.tfevents.*")
         content, found = path.read_bytes(), []

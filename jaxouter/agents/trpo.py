@@ -54,6 +54,8 @@ class TRPOConfig(AgentConfig):
     """The Fisher matrix is the mean over every so manieth step of an environment; 1: over all."""
     backtracks: int = 10
     """Largest number of halvings of a step, until the surrogate is better and the KL divergence within bounds."""
+    entropy: float = 0.0
+    """Weight of the policy's entropy in the objective."""
     sigma: float = 0.1
     """Standard deviation of the action (before its tanh) at first; 1 is the largest correction."""
     hold: bool = False
@@ -75,7 +77,7 @@ class TRPOConfig(AgentConfig):
 
     def check(self) -> None:
         """Raises ValueError if a setting is wrong; names the field, its value and what is allowed."""
-        check_on_policy(self, ("kl", "conjugate_gradients", "fisher_every"), ("damping", "backtracks"))
+        check_on_policy(self, ("kl", "conjugate_gradients", "fisher_every"), ("damping", "backtracks", "entropy"))
 
 
 class TRPOState(NamedTuple):
@@ -168,9 +170,10 @@ class TRPO:
         return cast(jax.Array, Value(self.config.hidden).apply(state.critic, obs))
 
     def surrogate(self, policy: GaussianPolicy, batch: Experience) -> jax.Array:
-        """Mean of the ratio of probabilities times the advantage (eq. 14), over this part of the batch."""
+        """Mean over the batch of the ratio of probabilities times the advantage (eq. 14), and the entropy."""
         log_ratio = log_probability(batch.extras.u, mean(self.config.hidden, policy, batch.obs), policy.log_sigma)
-        return jnp.mean(jnp.exp(log_ratio - batch.extras.log_probability) * batch.advantage)
+        ratio = jnp.exp(log_ratio - batch.extras.log_probability)
+        return jnp.mean(ratio * batch.advantage) + self.config.entropy * jnp.sum(policy.log_sigma)
 
     def divergence(self, policy: GaussianPolicy, other: GaussianPolicy, obs: jax.Array) -> jax.Array:
         """Mean KL divergence of the other policy from `policy` over observations (B, n)."""

@@ -46,7 +46,7 @@ from jaxouter.plants.simulators import PlantOptions
 from jaxouter.progress import Progress, clock, showing
 from jaxouter.tasks.presets import implied
 from jaxouter.terminal import Interrupt, optional
-from jaxouter.training import devices, tensorboard
+from jaxouter.training import devices, trackers
 from jaxouter.training.choice import choose
 from jaxouter.training.config import TrainConfig, from_dict, preset, to_dict, with_options
 from jaxouter.training.devices import Fleet, Processes
@@ -61,6 +61,7 @@ from jaxouter.training.trainer import Trainer
 LOOK_SECONDS = 5.0  # least time between two evaluations of the MAE during pretraining
 FRESH = 4  # folded into a key
 MAIN_FIGURE = "paper.png"
+ANIMATION = "episode.webp"
 WATCHING = 0.1  # share of the learning time so far that the first evaluation may take on a plant outside JAX
 
 
@@ -83,6 +84,7 @@ def learn(
     set: Mapping[str, Any] | None = None,
     episodes: int | None = None,
     tensorboard: bool = False,
+    wandb: bool = False,
     on_epoch: Report | None = None,
     **settings: Any,
 ) -> Run:
@@ -101,7 +103,7 @@ def learn(
             the preset's, or of the agent that is named among them: `{"name": NAME, "discount": 0.9}`.
         set: parameters of the plant, such as `{"tau": 0.7}`.
         episodes: of each scenario in the evaluation; None: the scenario's own number.
-        tensorboard: whether to write TensorBoard events too.
+        tensorboard, wandb: whether to write the metrics for these tools too.
         on_epoch: called with the seed and the row of metrics.jsonl after each epoch. What it raises ends the training;
             what was saved is intact.
         **settings: options of the command, such as `steps=20_000` or `pretraining={"gradient_steps": 500}`.
@@ -113,7 +115,9 @@ def learn(
     """
     with own_errors():
         config = configured(plant, preset, agent, set, {"seed": seed, **settings})
-        return training(config, out, progress=progress, episodes=episodes, events=tensorboard, on_epoch=on_epoch)
+        return training(
+            config, out, progress=progress, episodes=episodes, follow=following(tensorboard, wandb), on_epoch=on_epoch
+        )
 
 
 def resume(
@@ -122,6 +126,7 @@ def resume(
     *,
     episodes: int | None = None,
     tensorboard: bool = False,
+    wandb: bool = False,
     on_epoch: Report | None = None,
 ) -> Run:
     """Resume a run that was stopped, or that in a folder; other arguments and errors as for `learn`."""
@@ -132,7 +137,7 @@ def resume(
             resumes=run.path,
             progress=progress,
             episodes=episodes,
-            events=tensorboard,
+            follow=following(tensorboard, wandb),
             on_epoch=on_epoch,
         )
 
@@ -161,6 +166,11 @@ def configured(
     name = implied(name, flat.get("base", "lq"), known_agent)
     default = preset(add(plant, options, parameters), name, known_agent)
     return from_dict(to_dict(with_options(default, {**flat, "plant_options": options})))  # which looks at types too
+
+
+def following(tensorboard: bool, wandb: bool) -> tuple[str, ...]:
+    """Names of the trackers that are wanted."""
+    return tuple(name for name, wanted in (("tensorboard", tensorboard), ("wandb", wandb)) if wanted)
 
 
 def learners(
@@ -214,7 +224,7 @@ def training(
     resumes: Path | None = None,
     progress: bool | Progress = True,
     episodes: int | None = None,
-    events: bool = False,
+    follow: Sequence[str] = (),
     on_epoch: Report | None = None,
     processes: Processes = Processes(),  # noqa: B008 - frozen
 ) -> Run:
@@ -225,7 +235,7 @@ def training(
         out: new folder; None: the default one.
         resumes: folder of a run to resume instead.
         progress, episodes: as for `learn`.
-        events: whether to write TensorBoard events too.
+        follow: trackers of the metrics, see `jaxouter.training.trackers`.
         on_epoch: as for `learn`.
         processes: how this process finds the others.
     """
@@ -233,8 +243,7 @@ def training(
     config.check()
     if episodes is not None and episodes < 1:
         raise ValueError(f"--episodes is {episodes}; it must be at least 1")
-    if events:
-        tensorboard.require()
+    trackers.require(follow)
     devices.connect(config.devices, processes.check(config.devices))
     shown = progress if isinstance(progress, Progress) else progress and devices.is_first()
     with showing(shown) as progress, ExitStack() as stack:
@@ -249,7 +258,7 @@ def training(
         try:
             with own_errors():
                 with run.gone_if_nothing_is_learned() if fresh else nullcontext():
-                    finals = _trained(run, resumes is not None, events, on_epoch, progress)
+                    finals = _trained(run, resumes is not None, follow, on_epoch, progress)
                 if devices.is_first() and finals is not None:
                     report(run, finals, progress, episodes)
         except PlantError as error:
@@ -291,7 +300,7 @@ def go_on(run: RunFolder) -> str:
 
 
 def _trained(
-    run: RunFolder, resumed: bool, events: bool, on_epoch: Report | None, progress: Progress
+    run: RunFolder, resumed: bool, follow: Sequence[str], on_epoch: Report | None, progress: Progress
 ) -> dict[int, TrainState] | None:
     """Train with progress, to the end or until a signal."""
     config = run.config
@@ -320,12 +329,11 @@ def _trained(
 
     shown = Learning(progress, config, plant, first)
     stopping = Interrupt("what runs now ends, then everything is saved")
-    with stopping as interrupt, closing(tensorboard.Events(run)) as board:
+    with stopping as interrupt, closing(trackers.Trackers(run, follow)) as followed:
 
         def on_row(seed: int, row: Row) -> None:
             shown.epoch(seed, row)
-            if events:
-                board(seed, row)
+            followed(seed, row)
             if on_epoch is not None:
                 on_epoch(seed, row)
 
@@ -499,7 +507,10 @@ def draw(
     )
     for scenario in selected:
         name = f"{slug(scenario.id)}.png"
-        figures.keep(figures.response([scenario], inner_traces, traces), run.figures / name)
+        figure = figures.response([scenario], inner_traces, traces)
+        figures.keep(figure, run.figures / name)
+        if scenario is selected[0]:
+            figures.animate(figure, run.figures / ANIMATION)
         drawn()
     maes = {name: results[selected[0].id].figures.mae for name, results in simple.items()}
     levels = {name: value for name, value in maes.items() if value is not None}

@@ -44,12 +44,24 @@ if "matplotlib" not in sys.modules:
 import matplotlib.figure
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
-__all__ = ["DPI", "Axes", "Figure", "Line2D", "LogLocator", "LogNorm", "NullFormatter", "SubFigure", "rc_context"]
+__all__ = [
+    "DPI",
+    "Axes",
+    "Figure",
+    "FigureCanvasAgg",
+    "Line2D",
+    "LogLocator",
+    "LogNorm",
+    "NullFormatter",
+    "SubFigure",
+    "rc_context",
+]
 
 DPI = 130
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxouter.evaluation.drawing import DPI, Axes, Figure, LogLocator, NullFormatter, rc_context
+from jaxouter.evaluation.drawing import DPI, Axes, Figure, FigureCanvasAgg, LogLocator, NullFormatter, rc_context
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import Traces
 from jaxouter.evaluation.scenarios import Scenario
@@ -25,6 +25,9 @@ LIVE_ROWS = 600  # the same, at either end
 FAR = 4.0  # levels above so many times the largest MAE are not drawn: the curves would be flat
 LETTER, HANDLE = 0.067, 0.62  # widths in a legend, inches
 LIMITS: dict[str, Any] = dict(color=LIMIT, ls=":", lw=1.2, label="limits of y, bounds of r̃")
+SET_POINT = "reference r"
+STAYS = (SET_POINT, str(LIMITS["label"]))  # lines that an animation shows from the beginning
+FRAMES, SECONDS = 60, 6  # of an animation
 WIDE, NARROW = (dict[str, Any](color=LEARNED, alpha=alpha, lw=0) for alpha in (0.12, 0.25))
 
 
@@ -47,6 +50,31 @@ def keep(figure: Figure, path: Path) -> Path:
     """Write a figure of a run or a report as PNG, to the path that is returned, and as SVG beside it."""
     with rc_context({"svg.hashsalt": "jaxouter"}):  # else each time another file
         figure.savefig(save(figure, path).with_suffix(".svg"), metadata={"Date": None})
+    return path
+
+
+def animate(figure: Figure, path: Path) -> Path:
+    """Write a figure of responses over time as an animation (.webp), in which they run along from left to right."""
+    from PIL import Image  # comes with matplotlib
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.array(canvas.buffer_rgba())[..., :3]
+    for axes in figure.axes:
+        for artist in (*axes.lines, *axes.collections, *axes.texts):
+            artist.set_visible(str(artist.get_label()) in STAYS)
+    canvas.draw()
+    empty, height = np.array(canvas.buffer_rgba())[..., :3], drawn.shape[0]
+    frames = []
+    for share in np.linspace(0.0, 1.0, FRAMES):
+        frame = drawn.copy()
+        for box in (axes.bbox for axes in figure.axes):
+            begin, rows = int(box.x0 + share * box.width), slice(int(height - box.y1), int(height - box.y0))
+            frame[rows, begin : int(box.x1)] = empty[rows, begin : int(box.x1)]
+        frames.append(Image.fromarray(frame))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    milliseconds = [*[SECONDS * 1000 // FRAMES] * (FRAMES - 1), 1500]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, quality=70, method=0)
     return path
 
 
@@ -131,7 +159,7 @@ def _outputs(axes: Axes, scenario: Scenario, alone: Traces, learned: Traces) -> 
         for bound in (-limit, limit):
             axes.axhline(bound, **LIMITS)
     r = np.append(alone.r[0], alone.r[0, -1])
-    axes.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r")
+    axes.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label=SET_POINT)
     both = {"y, inner loop alone": (alone, INNER), "y, learned outer loop": (learned, LEARNED)}
     for label, (traces, color) in both.items():
         axes.plot(t, np.append(traces.y0[0], traces.y[0]), color=color, lw=1.8, label=label)
@@ -276,7 +304,7 @@ def live(steps: Mapping[str, np.ndarray], unit: str = "1") -> Figure:
     for column, (title, shown) in enumerate((("beginning", slice(LIVE_ROWS)), ("end", slice(-LIVE_ROWS, None)))):
         t, r, y, r_tilde, passed = (steps[name][shown] for name in ("time", "r", "y", "r_tilde", "y_passed"))
         above, below = grid[:, column]
-        above.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label="reference r")
+        above.step(t, r, where="post", color=REFERENCE, lw=1.2, ls="--", label=SET_POINT)
         if np.isfinite(passed).any():
             above.plot(t, passed, color=INNER, lw=1.2, label="y if r passed through")
         above.plot(t, y, color=LEARNED, lw=1.6, label="output y")

@@ -177,7 +177,8 @@ def _check(seed: int, epoch: int, state: TrainState) -> None:
     """Raises NotFiniteError; names what is not finite."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(state.agent):
         if not np.isfinite(leaf).all():
-            name = str(getattr(path[0], "name", "agent")).replace("_", " ")
+            names = [str(key.name) for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
+            name = next((each for each in names if each != "learner"), "agent").replace("_", " ")
             raise NotFiniteError(f"seed {seed}, epoch {epoch}: {name} is not finite any more")
 
 

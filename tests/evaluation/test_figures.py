@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxouter.evaluation import figures, scenarios
 from jaxouter.evaluation.rollout import Traces
@@ -55,6 +56,23 @@ def test_a_figure_has_one_legend_outside_its_axes_and_both_loops_share_one(house
     assert {"y, inner loop alone", "y, learned outer loop", "reference r"} <= names
     assert [axes.get_ylabel() for axes in figure.axes[::2]] == ["y [°C]", "r̃ [°C]", "|Δy| [°C/h]"]
     assert texts(figure) == []
+
+
+def test_in_an_animation_the_responses_run_along_and_the_rest_stays(houses, tmp_path):
+    selected, traces = houses
+    path = figures.animate(figures.response(selected[:1], traces, traces), tmp_path / "episode.webp")
+    with Image.open(path) as film:
+        assert film.n_frames == figures.FRAMES
+        frames = []
+        for i in (0, figures.FRAMES // 2, figures.FRAMES - 1):
+            film.seek(i)
+            frames.append(np.asarray(film.convert("RGB"), float))
+    begun, half, ended = frames
+    changed = [np.abs(frame - begun).max((0, 2)) > 60 for frame in (half, ended)]  # by column
+    columns = [np.flatnonzero(each) for each in changed]
+    width = begun.shape[1]
+    assert columns[0].max() < 0.6 * width < 0.9 * width < columns[1].max()
+    assert columns[0].min() == pytest.approx(columns[1].min(), abs=8)
 
 
 def test_what_leaves_the_frame_for_good_is_said_to_diverge():
