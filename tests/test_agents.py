@@ -68,6 +68,7 @@ def test_another_agent_learns_from_scratch_with_the_settings_that_it_shares(name
     assert configured("pitch", "paper", name, None, {}).base == "absolute"
 
 
+@pytest.mark.slow
 def test_agents_are_compared_side_by_side_and_trained_once(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(OWN, "ppo", {**OWN["ppo"], **QUICK})

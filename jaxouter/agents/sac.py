@@ -17,6 +17,7 @@ from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, OffPolicy, Transitions
 from jaxouter.agents.gaussian import log_probability
 from jaxouter.agents.networks import Actor, Critic, QuadraticCritic
+from jaxouter.agents.noise import ornstein_uhlenbeck
 from jaxouter.agents.updates import RateDecay, of_batch, scheduled, where
 from jaxouter.agents.whitening import Whitened, whitened
 
@@ -46,6 +47,8 @@ class SACConfig(AgentConfig):
     0.02."""
     sigma: float = 0.1
     """Standard deviation of the action (before its tanh) at first."""
+    noise_theta: float = 0.15
+    """Mean reversion rate of the exploration noise, which keeps its distribution; 1 is white noise, as in the paper."""
     batch_size: int = 256
     """Transitions per update."""
     discount: float = 0.99
@@ -86,8 +89,9 @@ class SACConfig(AgentConfig):
         for field in ("saturation_penalty", "whiten"):
             if not getattr(self, field) >= 0:
                 raise ValueError(f"agent.{field} is {getattr(self, field)}; it must not be negative")
-        if not 0 < self.polyak <= 1:
-            raise ValueError(f"agent.polyak is {self.polyak}; it must lie in (0, 1]")
+        for field in ("polyak", "noise_theta"):
+            if not 0 < getattr(self, field) <= 1:
+                raise ValueError(f"agent.{field} is {getattr(self, field)}; it must lie in (0, 1]")
         if self.critic not in ("mlp", "quadratic"):
             raise ValueError(f"agent.critic is {self.critic!r}; it must be mlp or quadratic")
 
@@ -162,17 +166,21 @@ class SAC:
         """The state with another actor."""
         return state._replace(actor=actor)
 
-    def noise(self, environments: int) -> tuple[()]:
-        """None: each step's is drawn anew."""
-        del environments
-        return ()
+    def noise(self, environments: int) -> jax.Array:
+        """Standard normal numbers of the step before, (E, m)."""
+        return jnp.zeros((environments, self.action_size))
 
     def explore(
-        self, state: SACState, noise: tuple[()], obs: jax.Array, normal: jax.Array, first: Any, progress: Any
-    ) -> tuple[jax.Array, tuple[()], tuple[()]]:
-        """A random action; see `Agent.explore`."""
-        del first, progress
-        return self.draw((state.actor, state.deviation), obs, normal)[0], noise, ()
+        self, state: SACState, noise: jax.Array, obs: jax.Array, normal: jax.Array, first: jax.Array, progress: Any
+    ) -> tuple[jax.Array, jax.Array, tuple[()]]:
+        """A random action whose noise is correlated over time, and anew in each episode; see `Agent.explore`.
+
+        Source: Eberhard et al., Pink noise is all you need: colored noise exploration in deep RL, 2023.
+        """
+        del progress
+        theta = self.config.noise_theta
+        noise = jnp.where(first, normal, ornstein_uhlenbeck(noise, normal, theta, (theta * (2.0 - theta)) ** 0.5))
+        return self.draw((state.actor, state.deviation), obs, noise)[0], noise, ()
 
     def draw(
         self, policy: tuple[Any, Any], obs: jax.Array, normal: jax.Array

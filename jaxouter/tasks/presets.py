@@ -62,23 +62,34 @@ SCRATCH: Options = {
     "pairs.noise_sigma": (0.005, 0.03),
 }
 PRESETS: Mapping[str, Options] = {"default": DEFAULT, "scratch": SCRATCH, "record": RECORD, "paper": PAPER}
-OFF_POLICY: Options = {"pairs.rounds": 0, "steps": 665_600, "agent.updates": 6}
 ON_POLICY: Options = {
     "pairs.rounds": 0,
-    "environments": 64,
     "epoch": 64_000,
     "steps": 5_132_800,
-    "agent.unroll": 50,
-    "agent.prefill": 12_800,
-    "agent.whiten": 0.2,
-    "agent.hold": True,
     "agent.hidden": (64, 64),
+    "agent.unroll": 25,
+    "agent.prefill": 12_800,
+    "agent.sigma": 0.05,
+    "agent.entropy": 0.03,  # else sigma shrinks, and with it what a step of the policy can be
 }
 LEARNERS: Mapping[str, Options] = {
-    "td3": {**OFF_POLICY, "agent.target_noise": 0.02, "agent.target_noise_clip": 0.05},
-    "sac": {**OFF_POLICY, "agent.temperature": 1e-3, "agent.target_entropy": -2.5, "agent.sigma": 0.02},
-    "ppo": {**ON_POLICY, "agent.sigma": 0.03},
-    "trpo": {**ON_POLICY, "agent.sigma": 0.03},
+    "td3": {
+        "pairs.rounds": 0,
+        "agent.actor_rate": 1e-3,  # of half as many updates as DDPG's
+        "agent.polyak": 0.01,
+        "agent.target_noise": 0.005,
+        "agent.target_noise_clip": 0.0125,
+    },
+    "sac": {
+        "pairs.rounds": 0,
+        "agent.n_step": 8,
+        "agent.temperature": 5e-3,
+        "agent.temperature_rate": 1e-3,
+        "agent.target_entropy": -1.2,
+        "agent.sigma": 0.07,
+    },
+    "ppo": {**ON_POLICY, "agent.actor_rate": 1e-3, "agent.minibatches": 4},
+    "trpo": {**ON_POLICY, "agent.kl": 0.02, "agent.damping": 100.0},  # as the Fisher matrix has 1 / sigma^2
 }
 """What `scratch` has otherwise with other agents than its own: they learn without pairs."""
 LIVE: Options = {  # an unknown plant in real time: an update must fit into milliseconds
