@@ -71,13 +71,14 @@ class WeightsAndBiases:
         import wandb  # pyright: ignore[reportMissingImports]
 
         name = run.path.resolve().name
+        mode: Any = os.environ.get("WANDB_MODE", "online" if "WANDB_API_KEY" in os.environ else "offline")
         self._run = wandb.init(
             project=PROJECT,
             group=name,
             name=f"{name}, seed {seed}",
             config=to_dict(run.config),
             dir=run.path,
-            mode=os.environ.get("WANDB_MODE", "online" if "WANDB_API_KEY" in os.environ else "offline"),
+            mode=mode,
             reinit="create_new",
             settings=wandb.Settings(silent=True, console="off"),
         )
