@@ -38,6 +38,7 @@ MAKERS = (  # what a file's name begins with, the most special first, and what m
     ("robust-", f"{TRAIN} PLANT --preset robust --seeds 5; python benchmarks/robust.py runs/PLANT-robust-0"),
     ("sample-efficiency", "python benchmarks/sample_efficiency.py"),
     ("over-base", "python benchmarks/over_base.py"),
+    ("learners-", "python benchmarks/learners.py --plant PLANT"),
     ("time-to-quality", "python benchmarks/time_to_quality.py --peers"),
     ("unstable", "python benchmarks/unstable.py"),
     ("bank", f"{TRAIN} pitch --preset robust --devices 2; python benchmarks/bank.py runs/pitch-robust-0"),

@@ -117,7 +117,7 @@ def test_the_plant_has_presets_scenarios_and_a_sweep_of_its_own(tmp_path):
         ),
         ({"pretraining.gradient_steps": "many"}, "pretraining.gradient_steps is of type str; it must be int"),
         ({"agent.hidden": 8}, "is of type int; it must be array"),
-        ({"agent": "sac"}, "there is no agent 'sac'"),
+        ({"agent": "dqn"}, "there is no agent 'dqn'"),
     ],
 )
 def test_a_preset_of_ones_own_that_is_wrong_is_named(options, text):
@@ -164,7 +164,7 @@ def test_the_gradient_is_that_of_the_expected_reward():
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["--agent", "sac"], "there is no agent 'sac'; the agents are: ddpg"),
+        (["--agent", "dqn"], "there is no agent 'dqn'; the agents are: ddpg"),
         (["--agent", f"{HERE}/room.py:ROOM"], "it must be a subclass of jaxouter.agents.AgentConfig"),
         (["--agent", f"{ROOT}/jaxouter/agents/agent.py:AgentConfig"], "does not define build, data"),
         (
