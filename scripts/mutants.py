@@ -75,7 +75,7 @@ MUTANTS = (
     ),
     Mutant(
         "a loss that is not finite reaches the networks",
-        "jaxouter/agents/ddpg.py", "finite = jnp.isfinite(loss)", "finite = ~jnp.isnan(loss)",
+        "jaxouter/agents/updates.py", "finite = jnp.isfinite(loss)", "finite = ~jnp.isnan(loss)",
         "tests/agents/test_ddpg.py",
     ),
     Mutant(
