@@ -1,6 +1,6 @@
 """Our learners side by side, each from scratch on the static prefilter: MAE over wall time and environment steps.
 
-    python benchmarks/learners.py                    # pitch, five seeds of each; 60 minutes on 2 cores
+    python benchmarks/learners.py                    # pitch, five seeds of each; about an hour on 2 cores
     python benchmarks/learners.py --plant heaters
     python benchmarks/learners.py --peers            # pitch alone: also those of stable-baselines3 and sbx; hours
 

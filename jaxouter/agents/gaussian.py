@@ -1,4 +1,4 @@
-"""The random policy of PPO and TRPO: u = mu(s) + sigma n, of which the action is tanh u.
+"""What PPO and TRPO share: a random policy, u = mu(s) + sigma n, of which the action is tanh u.
 
 u and not the action is kept: ratios of its probabilities are those of the action's, and nothing is lost where the
 action is at its bounds. sigma is a parameter of its own, the same in all states.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
-from jaxouter.agents.networks import Actor
+from jaxouter.agents.networks import Actor, Value
 
 
 class GaussianPolicy(NamedTuple):
@@ -26,6 +27,16 @@ class Sample(NamedTuple):
 
     u: jax.Array  # before the tanh
     log_probability: jax.Array  # density of u, then
+
+
+def initial(
+    hidden: tuple[int, ...], sigma: float, obs_size: int, action_size: int, key: chex.PRNGKey
+) -> tuple[GaussianPolicy, Any]:
+    """A random policy with this standard deviation, and a random critic."""
+    key_actor, key_critic = jax.random.split(key)
+    actor = Actor(hidden, action_size).init(key_actor, jnp.zeros(obs_size))
+    critic = Value(hidden).init(key_critic, jnp.zeros(obs_size))
+    return GaussianPolicy(actor, jnp.full(action_size, jnp.log(sigma))), critic
 
 
 def mean(hidden: tuple[int, ...], policy: GaussianPolicy, obs: jax.Array) -> jax.Array:
@@ -63,3 +74,28 @@ def normalised(advantage: jax.Array, axis: str | None) -> jax.Array:
     moments = jnp.mean(advantage), jnp.mean(advantage**2)
     first, second = moments if axis is None else jax.lax.pmean(moments, axis)
     return (advantage - first) / jnp.sqrt(jnp.maximum(second - first**2, 1e-12))
+
+
+def check_on_policy(config: Any, positive: tuple[str, ...], not_negative: tuple[str, ...]) -> None:
+    """Check the settings that PPO and TRPO share, and others by name.
+
+    Raises:
+        ValueError: names the field, its value and what is allowed.
+    """
+    for field in ("unroll", "epochs", "minibatches", "sigma", "critic_rate", *positive):
+        if not getattr(config, field) > 0:
+            raise ValueError(f"agent.{field} is {getattr(config, field)}; it must be positive")
+    for field in ("whiten", "prefill", *not_negative):
+        if not getattr(config, field) >= 0:
+            raise ValueError(f"agent.{field} is {getattr(config, field)}; it must not be negative")
+    if bool(config.whiten) != bool(config.prefill):
+        raise ValueError(
+            f"agent.whiten is {config.whiten} and agent.prefill is {config.prefill}; both must be positive, or 0"
+        )
+    if not 0 <= config.discount < 1 or not 0 <= config.gae_lambda <= 1:
+        raise ValueError(
+            f"agent.discount is {config.discount} and agent.gae_lambda is {config.gae_lambda}; "
+            "they must lie in [0, 1) and in [0, 1]"
+        )
+    if not config.hidden or min(config.hidden) < 1:
+        raise ValueError(f"agent.hidden is {config.hidden}; it must be positive widths")

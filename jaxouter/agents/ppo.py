@@ -15,8 +15,17 @@ import optax
 
 from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, Experience, OnPolicy
-from jaxouter.agents.gaussian import GaussianPolicy, Sample, draw, log_probability, mean, normalised
-from jaxouter.agents.networks import Actor, Value
+from jaxouter.agents.gaussian import (
+    GaussianPolicy,
+    Sample,
+    check_on_policy,
+    draw,
+    initial,
+    log_probability,
+    mean,
+    normalised,
+)
+from jaxouter.agents.networks import Value
 from jaxouter.agents.updates import RateDecay, of_batch, scheduled, where
 from jaxouter.agents.whitening import Whitened, whitened
 
@@ -76,31 +85,6 @@ class PPOConfig(AgentConfig):
         check_on_policy(self, ("clip",), ("kl", "value_clip", "entropy", "gradient_norm"))
 
 
-def check_on_policy(config: Any, positive: tuple[str, ...], not_negative: tuple[str, ...]) -> None:
-    """Check the settings that PPO and TRPO share, and others by name.
-
-    Raises:
-        ValueError: names the field, its value and what is allowed.
-    """
-    for field in ("unroll", "epochs", "minibatches", "sigma", "critic_rate", *positive):
-        if not getattr(config, field) > 0:
-            raise ValueError(f"agent.{field} is {getattr(config, field)}; it must be positive")
-    for field in ("whiten", "prefill", *not_negative):
-        if not getattr(config, field) >= 0:
-            raise ValueError(f"agent.{field} is {getattr(config, field)}; it must not be negative")
-    if bool(config.whiten) != bool(config.prefill):
-        raise ValueError(
-            f"agent.whiten is {config.whiten} and agent.prefill is {config.prefill}; both must be positive, or 0"
-        )
-    if not 0 <= config.discount < 1 or not 0 <= config.gae_lambda <= 1:
-        raise ValueError(
-            f"agent.discount is {config.discount} and agent.gae_lambda is {config.gae_lambda}; "
-            "they must lie in [0, 1) and in [0, 1]"
-        )
-    if not config.hidden or min(config.hidden) < 1:
-        raise ValueError(f"agent.hidden is {config.hidden}; it must be positive widths")
-
-
 class PPOState(NamedTuple):
     """State of the learner."""
 
@@ -136,10 +120,7 @@ class PPO:
 
     def init(self, key: chex.PRNGKey) -> PPOState:
         """Random networks."""
-        key_actor, key_critic = jax.random.split(key)
-        actor = Actor(self.config.hidden, self.action_size).init(key_actor, jnp.zeros(self.obs_size))
-        policy = GaussianPolicy(actor, jnp.full(self.action_size, jnp.log(self.config.sigma)))
-        critic = Value(self.config.hidden).init(key_critic, jnp.zeros(self.obs_size))
+        policy, critic = initial(self.config.hidden, self.config.sigma, self.obs_size, self.action_size, key)
         return PPOState(
             policy=policy,
             critic=critic,

@@ -17,9 +17,18 @@ from jax.flatten_util import ravel_pytree
 
 from jaxouter.agents.adam import adam, descend
 from jaxouter.agents.agent import AgentConfig, Experience, OnPolicy
-from jaxouter.agents.gaussian import GaussianPolicy, Sample, divergence, draw, log_probability, mean, normalised
-from jaxouter.agents.networks import Actor, Value
-from jaxouter.agents.ppo import check_on_policy
+from jaxouter.agents.gaussian import (
+    GaussianPolicy,
+    Sample,
+    check_on_policy,
+    divergence,
+    draw,
+    initial,
+    log_probability,
+    mean,
+    normalised,
+)
+from jaxouter.agents.networks import Value
 from jaxouter.agents.updates import RateDecay, averaged, of_batch, scheduled, where
 from jaxouter.agents.whitening import Whitened, whitened
 
@@ -138,10 +147,7 @@ class TRPO:
 
     def init(self, key: chex.PRNGKey) -> TRPOState:
         """Random networks."""
-        key_actor, key_critic = jax.random.split(key)
-        actor = Actor(self.config.hidden, self.action_size).init(key_actor, jnp.zeros(self.obs_size))
-        critic = Value(self.config.hidden).init(key_critic, jnp.zeros(self.obs_size))
-        policy = GaussianPolicy(actor, jnp.full(self.action_size, jnp.log(self.config.sigma)))
+        policy, critic = initial(self.config.hidden, self.config.sigma, self.obs_size, self.action_size, key)
         return TRPOState(policy, critic, self._optimiser.init(critic))
 
     def actor(self, state: TRPOState) -> Any:
