@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -291,10 +292,9 @@ def test_columns_are_as_many_as_text_needs(monkeypatch, given, found):
     assert os.environ["COLUMNS"] == str(found)
 
 
-@pytest.mark.parametrize("width", [1, 20])
-def test_a_narrow_terminal_has_room_for_every_table(width, monkeypatch):
+def test_a_narrow_terminal_has_room_for_every_table(monkeypatch):
     out = io.StringIO()
-    monkeypatch.setattr(cli, "console", Console(file=out, width=width, force_terminal=True))
+    monkeypatch.setattr(cli, "console", Console(file=out, width=20, force_terminal=True))
     cli.table("MAE, crad", ["scenario", "learned", "none"], [["pitch/paper", "2.68", "11.90"]])
     cli.print_lists()
-    assert max(map(len, out.getvalue().splitlines())) > 0
+    assert {"2.68", "11.90", "pitch"} <= set(re.findall(r"[\w.]+", out.getvalue()))

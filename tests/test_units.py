@@ -130,6 +130,9 @@ def Ones():
 def Millionths():
     return lag.make(unit=1e-6)
 
+def HundredThousands():
+    return lag.make(unit=1e5)
+
 def Powers():
     return lag.make(unit=2.0**17)
 """
@@ -146,7 +149,8 @@ def test_relative_figures_are_the_same_in_any_unit(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     (tmp_path / "units.py").write_text(PLANTS)
     found = {}
-    for name, unit in (("Ones", 1.0), ("Millionths", 1e-6), ("Powers", 2.0**17)):
+    units = {"Ones": 1.0, "Millionths": 1e-6, "HundredThousands": 1e5, "Powers": 2.0**17}
+    for name, unit in units.items():
         plant = f"units.py:{name}"
         run = jaxouter.learn(plant, "record", out=f"run-{name}", pretraining={"gradient_steps": 500})
         check.main([plant])
@@ -160,4 +164,5 @@ def test_relative_figures_are_the_same_in_any_unit(tmp_path, monkeypatch, capsys
     for key, value in found["Ones"].items():
         assert found["Powers"][key] == pytest.approx(value, rel=0.01), key
         tolerance = 0.05 if key in learned else 0.01
-        assert found["Millionths"][key] == pytest.approx(value, rel=tolerance, abs=1e-3), key
+        for name in ("Millionths", "HundredThousands"):
+            assert found[name][key] == pytest.approx(value, rel=tolerance, abs=1e-3), f"{name}: {key}"
