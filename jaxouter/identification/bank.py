@@ -7,6 +7,7 @@ actor for all of these plants replays the episodes (`counterfactual`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -118,8 +119,10 @@ def identify(
             )
         found.append(of_member)
     a, b = (np.stack([getattr(each.model, name) for each in found]) for name in ("a", "b"))
-    counts = [len(each.replayed.y) for each in found]
-    r_tilde, y = map(np.concatenate, zip(*(each.replayed for each in found), strict=True))
+    kept = [len(each.replayed.y) for each in found]
+    counts = [round(math.sqrt(n * max(kept))) for n in kept]  # episodes are repeated where few can be brought back
+    repeated = [[np.resize(x, (n, x.shape[1])) for x in each.replayed] for n, each in zip(counts, found, strict=True)]
+    r_tilde, y = map(np.concatenate, zip(*repeated, strict=True))
     known = (np.repeat(a, counts, 0), np.repeat(b, counts, 0), r_tilde, y, y)
     half = float(np.ptp(plant.setpoint_range)) / 2
     made = bank.of([each.law for each in found], a, b, half)

@@ -54,7 +54,7 @@ ROBUST = {
     "reward.huber": 0.0,
     "disturbances.noise": 0.0125,
     "disturbances.load": 0.0,
-    "pretraining.gradient_steps": 6_000,
+    "pretraining.gradient_steps": 10_000,
     "pretraining.closed_loop": 128,
     "pretraining.lags": 100,
     "pretraining.episode_steps": 400,
