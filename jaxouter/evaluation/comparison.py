@@ -22,6 +22,7 @@ from jaxouter.evaluation.jobs import Done, Entrant, Job
 from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.evaluation.policies import check, several
 from jaxouter.evaluation.results import Comparison
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.plants import Plant, host
 from jaxouter.plants.registry import REGISTRATIONS, Maker, own_errors
 from jaxouter.progress import Progress, showing
@@ -138,7 +139,7 @@ def select(
     entrants = list(dict.fromkeys([*entrants, *named(several(policies), plants.make(name)[0])]))
     for entrant in entrants:
         if entrant.kind in ("learned", "user"):
-            jobs.load(entrant, name)  # what can't be loaded is said before minutes of tuning
+            jobs.load(entrant, Known(name))  # what can't be loaded is said before minutes of tuning
     return Selection(name, tuple(entrants), tuple(chosen), tuple(swept), family_seed, folder(out, name))
 
 

@@ -37,6 +37,7 @@ from jaxouter.evaluation.cache import Tuned
 from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit
 from jaxouter.evaluation.results import GridErrors, PolicyInfo, Row, StabilityRow, SweepErrors
 from jaxouter.evaluation.rollout import Traces, rollout
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.loop.policy import Policy
 from jaxouter.plants import Plant, make
 from jaxouter.plants.errors import PlantError
@@ -83,7 +84,7 @@ class Job(NamedTuple):
     what: Literal["identify", "evaluate", "sweep", "stability"]
     entrant: Entrant
     plant: str
-    on: str = ""  # scenario or sweep; of an identification, the plant where it is another one
+    on: str = ""  # scenario or sweep; of an identification the first scenario that it is for, "" the nominal plant
     family_seed: int = scenarios.FAMILY_SEED
 
     @property
@@ -94,11 +95,10 @@ class Job(NamedTuple):
         return {"evaluate": 1.0, "sweep": 5.0, "stability": 3.0}[self.what]
 
     @property
-    def needs(self) -> tuple[Entrant, str]:
+    def needs(self) -> tuple[Entrant, Known]:
         """Policy, and the plant on which it is identified."""
-        if self.what == "identify":
-            return self.entrant, self.on or self.plant
-        return self.entrant, self.plant if self.what == "sweep" else made_for(self.entrant, self.plant, self.on)
+        nominal = self.what == "sweep" or not self.on
+        return self.entrant, Known(self.plant) if nominal else made_for(self.entrant, self.plant, self.on)
 
     def __str__(self) -> str:
         seed = "" if self.entrant.seed is None else f" seed {self.entrant.seed}"
@@ -131,9 +131,9 @@ def entrant(name: str, plant: Plant) -> Entrant:
     return Entrant(name, "preview" if name == CLAIRVOYANT else resolve(name).kind)
 
 
-def made_for(entrant: Entrant, plant: str, on: str) -> str:
-    """Name of the plant for which a policy is made that acts in a scenario: a limit knows the scenario's own."""
-    return scenarios.known(on) if entrant.kind == "limit" else plant
+def made_for(entrant: Entrant, plant: str, on: str) -> Known:
+    """The plant for which a policy is made that acts in a scenario: a limit knows the scenario's own."""
+    return scenarios.known(on) if entrant.kind == "limit" else Known(plant)
 
 
 def short(name: str) -> str:
@@ -165,20 +165,20 @@ def blamed(name: str, what: str, own: bool = True) -> Iterator[None]:
 
 
 @lru_cache(maxsize=64)
-def load(entrant: Entrant, plant_name: str) -> tuple[Policy, Any]:
+def load(entrant: Entrant, of: Known) -> tuple[Policy, Any]:
     """The policy and its parameters.
 
     Raises:
         ValueError: a run has no checkpoint, or a user's policy can't be made.
     """
-    plant, _ = make(plant_name)
+    plant, _ = make(of.plant)
     if entrant.kind == "learned":
         return RunFolder.open(Path(entrant.path or "")).policy(entrant.seed or 0)
     if entrant.kind == "user":
         with blamed(entrant.name, "can't be made"):
             policy = attribute(Path(entrant.path or ""), entrant.attribute, OWN)(plant)
         return policy, getattr(policy, "params", ())
-    return resolve(entrant.name).build(plant, identified(entrant.name, plant_name))
+    return resolve(entrant.name).build(plant, identified(entrant.name, of))
 
 
 def evaluate(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
@@ -198,7 +198,7 @@ def evaluate(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tu
 def sweep(entrant: Entrant, plant_name: str, on: str, family_seed: int) -> Tuned:
     """MAE over the grid of a sweep, a coarser one for policies that run on the host."""
     del family_seed
-    policy, params = load(entrant, plant_name)
+    policy, params = load(entrant, Known(plant_name))
     swept = sweeps.get(on, coarse=policy.host)
     found = swept.mae(rollout(policy, params, swept.scenario))
     mae = np.where(np.isfinite(found), found.astype(object), np.array(None)).tolist()
@@ -247,12 +247,12 @@ def jobs(
     plant: str, entrants: Sequence[Entrant], selected: Sequence[str], swept: Sequence[str], family_seed: int
 ) -> list[Job]:
     """All jobs: identification first, of it the long ones."""
-    work = [
-        Job("identify", c, plant, "" if of == plant else of)
-        for c in reversed(entrants)
-        if c.kind in TUNED
-        for of in dict.fromkeys([plant, *(made_for(c, plant, on) for on in selected)])
-    ]
+    work: list[Job] = []
+    for c in reversed([c for c in entrants if c.kind in TUNED]):
+        first = {Known(plant): ""}
+        for on in selected:
+            first.setdefault(made_for(c, plant, on), on)
+        work += [Job("identify", c, plant, on) for on in first.values()]
     acting = [c for c in entrants if c.kind != "preview"]
     first_seeds = {c.line: c for c in reversed(acting)}  # of each run, for sweeps and stabilities
     one_seed = [c for c in acting if first_seeds[c.line] == c]

@@ -15,7 +15,7 @@ from jaxouter.evaluation.baselines import CLAIRVOYANT, identified, resolve
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit, mae
 from jaxouter.evaluation.rollout import Traces, rollout
-from jaxouter.evaluation.scenarios import FAMILY_SEED, Scenario
+from jaxouter.evaluation.scenarios import FAMILY_SEED, Known, Scenario
 from jaxouter.evaluation.verdict import Verdict
 from jaxouter.loop.policy import Policy, none
 from jaxouter.plants import Plant, host, make
@@ -96,22 +96,23 @@ class NamedPolicy:
         return signals if self.policy.host else (jnp.asarray(each, float) for each in signals)
 
 
-def baseline(name: str, plant_name: str, report: Report = lambda text, share: None) -> NamedPolicy:
-    """A baseline, identified on the nominal plant unless the cache has it.
+def baseline(name: str, of: str | Known, report: Report = lambda text, share: None) -> NamedPolicy:
+    """A baseline, identified on a plant unless the cache has it.
 
     Raises:
         ValueError: unknown name; lists those that exist.
     """
-    tuned = identified(name, plant_name, report)
-    return NamedPolicy(name, *resolve(name).build(make(plant_name)[0], tuned), plant_name)
+    of = Known(of) if isinstance(of, str) else of
+    return NamedPolicy(name, *resolve(name).build(make(of.plant)[0], identified(name, of, report)), of.plant)
 
 
-def named(policy: NamedPolicy | Policy | str, plant: str, progress: Progress) -> NamedPolicy:
+def named(policy: NamedPolicy | Policy | str, of: Known, progress: Progress) -> NamedPolicy:
     """The policy for a plant; a baseline is identified unless the cache has it, which is told.
 
     Raises:
         ValueError: there is no such policy, the plant does not allow it, or it can't be made.
     """
+    plant = of.plant
     if isinstance(policy, NamedPolicy):
         return policy
     if not isinstance(policy, str):
@@ -120,18 +121,19 @@ def named(policy: NamedPolicy | Policy | str, plant: str, progress: Progress) ->
         raise ValueError(f"{CLAIRVOYANT} is a bound, not a policy; python -m jaxouter.compare shows it")
     found = jobs.entrant(policy, make(plant)[0])
     if found.kind == "user":
-        return NamedPolicy(found.name, *jobs.load(found, plant), plant)
+        return NamedPolicy(found.name, *jobs.load(found, of), plant)
 
     def heard(text: str, share: float) -> None:
         if not text:
             note = baselines.resolve(policy).note
-            progress.print(f"{policy} on {plant}: {note} This is done once, and kept.")
+            noisy = f" with sensor noise of {of.noise:g}" if of.noise else ""
+            progress.print(f"{policy} on {plant}{noisy}: {note} This is done once, and kept.")
         elif share and not progress.done:
             progress.phase(f"tuning {policy}")
         progress.reach(share, at=text)
 
     progress.phase(f"identifying {policy}", 1.0)
-    return baseline(policy, plant, heard)
+    return baseline(policy, of, heard)
 
 
 def evaluate(
@@ -170,7 +172,7 @@ def evaluate(
         plant = add(plant or default, parameters=set)
         names = scenarios.identifiers(plant, several(scenario))
         limit = isinstance(policy, str) and policy in baselines.LIMITS  # which is made for the plant of each scenario
-        chosen = named(policy, scenarios.known(names[0]) if limit else plant, progress)
+        chosen = named(policy, scenarios.known(names[0]) if limit else Known(plant), progress)
         rollouts = 1 if chosen.name == "none" else 2
         if pace.seconds(names, episodes, rollouts) > pace.SAID:
             progress.print(f"{pace.told(names, episodes, rollouts)}; --episodes N is N of each")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,17 @@ NOISE_SEEDS = 32
 Builder = Callable[[int | None], "Scenario"]
 Place = Literal["inside", "edge", "outside"]
 ROUNDING = 1e-5  # of a number of the plant, by which it may lie outside its range
+
+
+class Known(NamedTuple):
+    """What those who know the plant of a scenario know."""
+
+    plant: str
+    """Its name, with parameters that differ from the nominal ones."""
+    noise: float = 0.0
+    """Standard deviation of the sensor's noise, in the unit of y; 0: that of training."""
+    smooth: bool = False
+    """Whether the plant has no noise of its own."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +140,8 @@ def plant_of(identifier: str) -> str:
     return identifier.rpartition("/")[0] or identifier
 
 
-def known(identifier: str) -> str:
-    """Name of the plant that those who know the plant of a scenario know: with the parameters that its task sets.
+def known(identifier: str) -> Known:
+    """What those who know the plant of a scenario know: the parameters that its task sets, and the sensor's noise.
 
     What makes no other plant (how many houses there are, and where they start) is left out. Where the inner loop alone
     is unstable, they know the nominal plant: a record of that one diverges.
@@ -138,15 +149,24 @@ def known(identifier: str) -> str:
     plant, _, name = identifier.rpartition("/")
     task = tasks.of(plant)
     spec = task.scenarios.get(name)
+    noise = spec.noise if spec else REST.get(name, 0.0) * float(np.ptp(make(plant)[0].setpoint_range))
+    noise = float(f"{noise:.1g}")  # one serves all that are about alike
+    smooth = noise > 0.0 and (spec is None or spec.smooth) and _has_noise(plant)
     if spec is None or not spec.stable_alone:
-        return plant
+        return Known(plant, noise, smooth)
     nominal = _numbers(make(plant)[1], task.start)
 
     def differs(setting: str) -> bool:
         other = _numbers(make(plant, **{setting: spec.set[setting]})[1], task.start)
         return any(not np.array_equal(leaf, nominal[key]) for key, leaf in other.items())
 
-    return with_parameters(plant, {setting: spec.set[setting] for setting in filter(differs, spec.set)})
+    return Known(with_parameters(plant, {name: spec.set[name] for name in filter(differs, spec.set)}), noise, smooth)
+
+
+def _has_noise(plant: str) -> bool:
+    """Whether a plant has noise of its own."""
+    made, params = make(plant)
+    return not all(map(np.array_equal, jax.tree.leaves(params), jax.tree.leaves(made.noise_free(params))))
 
 
 def builder(identifier: str, family_seed: int = FAMILY_SEED) -> Builder:

@@ -98,7 +98,7 @@ HEATERS = Task(
         "cold": Scenario(SETPOINTS, {"x_out": -15.0}, episodes=NOISE_SEEDS),
         "mixed-stock": Scenario(SETPOINTS, episodes=NOISE_SEEDS, adapt=_mixed_stock),
         "load": Scenario(SETPOINTS, MANY, change={"x_out": -15.0}, episodes=NOISE_SEEDS),
-        "noise": Scenario(SETPOINTS, MANY, episodes=NOISE_SEEDS, noise=0.1),
+        "noise": Scenario(SETPOINTS, MANY, episodes=NOISE_SEEDS, noise=0.1, smooth=True),
     },
     reported=("paper-4", "paper-1000"),
     stability=("paper-4", "riccati", "mixed-stock"),

@@ -29,6 +29,8 @@ class Scenario:
     episodes: int = 1
     noise: float = 0.0
     """Standard deviation of the measurement noise, in the unit of y."""
+    smooth: bool = False
+    """Whether the plant's own noise is negligible; where the sensor has noise, limits are made without it then."""
     stable_alone: bool = True
     """Whether the inner loop alone is stable; if not, an improvement in % means nothing."""
     paper: tuple[float, float] | None = None

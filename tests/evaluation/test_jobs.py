@@ -21,6 +21,7 @@ from jaxouter.evaluation.jobs import WITHIN, Done, Entrant, Job
 from jaxouter.evaluation.metrics import FiguresOfMerit, figures_of_merit
 from jaxouter.evaluation.results import GridErrors, Row, StabilityRow
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.evaluation.stability import analyse
 from jaxouter.identification import steady_state
 from jaxouter.loop.policy import none
@@ -265,13 +266,14 @@ def test_only_baselines_and_the_limit_are_identified():
 def test_the_limit_is_identified_on_each_plant_of_the_scenarios():
     all_of = jobs.jobs("pitch", ALL, ["pitch/paper", "pitch/delay-0.57", "pitch/noise"], ["pitch/gain"], 7)
     first = [(job.entrant, job.on) for job in all_of if job.what == "identify"]
-    own = "pitch(d1=0.57, d2=0.57)"
-    assert first == [(ORACLE, ""), (ORACLE, own), (STATIC, ""), (NONE, "")]
+    own, noisy = Known("pitch(d1=0.57, d2=0.57)"), Known("pitch", 0.2)
+    assert first == [(ORACLE, ""), (ORACLE, "pitch/delay-0.57"), (ORACLE, "pitch/noise"), (STATIC, ""), (NONE, "")]
     needs = {(job.what, job.on): job.needs[1] for job in all_of if job.entrant == ORACLE}
-    assert needs.pop(("evaluate", "pitch/delay-0.57")) == needs.pop(("stability", "pitch/delay-0.57")) == own
-    assert needs.pop(("identify", own)) == own
-    assert set(needs.values()) == {"pitch"}
-    assert {job.needs[1] for job in all_of if job.entrant != ORACLE} == {"pitch"}
+    of_own = [needs.pop((what, "pitch/delay-0.57")) for what in ("identify", "evaluate", "stability")]
+    assert of_own == [own, own, own]
+    assert needs.pop(("identify", "pitch/noise")) == needs.pop(("evaluate", "pitch/noise")) == noisy
+    assert set(needs.values()) == {Known("pitch")}
+    assert {job.needs[1] for job in all_of if job.entrant != ORACLE} == {Known("pitch")}
 
 
 def test_sweeps_take_the_first_seed_of_each_run_and_nothing_with_preview():
@@ -303,7 +305,7 @@ def assert_same_trees(a, b):
 
 
 def test_load_gives_a_baseline_as_it_was_identified():
-    policy, params = jobs.load(STATIC, "lag")
+    policy, params = jobs.load(STATIC, Known("lag"))
     expected = steady_state.static(*lag.make(), jax.random.key(0))
     assert policy == expected[0]
     assert_same_trees(params, expected[1])
@@ -314,7 +316,7 @@ def test_load_gives_the_seed_of_a_run(run):
     trainer, _ = run.trainer
     actors = []
     for seed in run.seeds:
-        policy, params = jobs.load(Entrant("learned", "learned", str(run.path), seed), "lag")
+        policy, params = jobs.load(Entrant("learned", "learned", str(run.path), seed), Known("lag"))
         assert policy == trainer.policy
         assert_same_trees(params, trainer.policy_params(run.load(seed)[0]))
         actors.append(jax.tree.leaves(params.actor))
@@ -324,8 +326,8 @@ def test_load_gives_the_seed_of_a_run(run):
 def test_users_policies_in_jax_and_in_plain_python_do_the_same(own):
     maes = [jobs.evaluate(own(name), "lag", "lag/steps", 2024).settings["mae"] for name in ("Jax", "Host")]
     assert maes[0] == pytest.approx(maes[1], rel=1e-5)
-    assert jobs.load(own("Jax"), "lag")[1] == (0.25,)
-    assert jobs.load(own("Host"), "lag")[1] == ()
+    assert jobs.load(own("Jax"), Known("lag"))[1] == (0.25,)
+    assert jobs.load(own("Host"), Known("lag"))[1] == ()
 
 
 def test_file_whose_annotations_are_strings_can_be_imported(tmp_path):
@@ -418,7 +420,7 @@ def test_sweep_is_the_error_over_the_grid():
 def test_stability_goes_over_the_range_of_evaluation(own):
     rows = jobs.analyse(STATIC, "lag", "lag/steps", 2024).settings["rows"]
     assert [row["set_point"] for row in rows] == pytest.approx(np.linspace(-1.0, 1.0, 19).tolist())
-    expected = analyse(*jobs.load(STATIC, "lag"), *lag.make(), [1.0])[0]
+    expected = analyse(*jobs.load(STATIC, Known("lag")), *lag.make(), [1.0])[0]
     assert rows[-1] == pytest.approx(msgspec.to_builtins(expected))
     assert rows[-1]["spectral_radius"] == pytest.approx(np.exp(-lag.CONTROL_STEP / 0.3), rel=1e-6)
     assert rows[-1]["y"] == pytest.approx(1.0, abs=1e-3)
@@ -451,11 +453,11 @@ def test_identified_knows_its_baselines():
     with pytest.raises(
         ValueError, match="no policy 'clairvoyant'; the policies are: none, static, lq, lq-return, pi, mpc"
     ):
-        identified("clairvoyant", "lag")
+        identified("clairvoyant", Known("lag"))
     with pytest.raises(ValueError, match="no plant 'boat'"):
-        identified("static", "boat")
-    assert identified("none", "lag").steps == 0
-    assert identified("static", "lag").steps == steady_state.LEVELS * lag.LAG.episode_steps
+        identified("static", Known("boat"))
+    assert identified("none", Known("lag")).steps == 0
+    assert identified("static", Known("lag")).steps == steady_state.LEVELS * lag.LAG.episode_steps
     for name, baseline in BASELINES.items():
         assert baseline.kind == ("limit" if name in ("oracle", "lq-exact", "mpc-exact") else "baseline")
 
@@ -534,7 +536,8 @@ def test_policies_say_what_they_are_and_what_they_took(run):
     entrants = [Entrant("learned", "learned", str(run.path), seed) for seed in (1, 0)]
     entrants += [USER, NONE, STATIC, CLAIRVOYANT]
     tuned = [
-        Done(Job("identify", c, "lag"), identified(c.name, "lag")._replace(seconds=2.5), 0.0) for c in (STATIC, NONE)
+        Done(Job("identify", c, "lag"), identified(c.name, Known("lag"))._replace(seconds=2.5), 0.0)
+        for c in (STATIC, NONE)
     ]
     known = jobs.policies(entrants, tuned)
     assert list(known) == ["learned", USER.name, "none", "static", "clairvoyant"]
@@ -543,7 +546,7 @@ def test_policies_say_what_they_are_and_what_they_took(run):
     assert known["learned"].settings == {run.path.name: "record"}
     assert known[USER.name].note == "Twice of own.py"
     assert (known["static"].steps, known["static"].seconds) == (400, 2.5)
-    assert known["static"].settings == identified("static", "lag").settings
+    assert known["static"].settings == identified("static", Known("lag")).settings
     for name in ("none", "static"):
         assert known[name].note == BASELINES[name].note
     assert all(each.note for each in known.values())

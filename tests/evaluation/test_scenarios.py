@@ -6,6 +6,7 @@ import pytest
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.loop.policy import none
 from tests.precision import of_single_draws
 
@@ -100,7 +101,7 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("identifier", "plant"),
+    ("identifier", "known"),
     [
         ("pitch/paper", "pitch"),
         ("pitch/steps", "pitch"),
@@ -109,12 +110,15 @@ def test_plant_without_scenarios_has_its_families(monkeypatch):
         ("pitch(tau=0.7)/delay-0.57", "pitch(tau=0.7, d1=0.57, d2=0.57)"),
         ("heaters/paper-1000", "heaters"),  # more houses of the same kind
         ("heaters/load", "heaters"),
+        ("heaters/noise", ("heaters", 0.1, True)),  # and the noise of the sensor; that of a thousand houses is small
+        ("heaters/rest-noise", ("heaters", 0.06, True)),
+        ("pitch/rest-noise", ("pitch", 0.2)),  # 0.204, to one digit
         ("heaters/cold", "heaters(x_out=-15.0)"),
         ("heaters/riccati", "heaters(Pi=17.186)"),
     ],
 )
-def test_plant_of_a_scenario_for_those_who_know_it(identifier, plant):
-    assert scenarios.known(identifier) == plant
+def test_plant_of_a_scenario_for_those_who_know_it(identifier, known):
+    assert scenarios.known(identifier) == (Known(known) if isinstance(known, str) else Known(*known))
 
 
 def test_unknown_scenario_lists_those_that_exist():

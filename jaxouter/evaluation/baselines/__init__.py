@@ -20,6 +20,7 @@ from jaxouter.evaluation import cache
 from jaxouter.evaluation.baselines import deepc, exact, inverse, lq, mpc, oracle, pi
 from jaxouter.evaluation.baselines.tuning import Report
 from jaxouter.evaluation.cache import Tuned
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.identification import steady_state
 from jaxouter.loop.policy import Linear, Policy, affine
 from jaxouter.plants import Plant, make
@@ -34,7 +35,8 @@ class Baseline(NamedTuple):
     """How a policy comes about."""
 
     kind: Kind
-    tune: Callable[[Plant, Any, chex.PRNGKey, int, Report], Tuned]
+    tune: Callable[..., Tuned]
+    """`tune(plant, params, key, budget, report)`; of a limit, unless it is your own, also `noise`, see `Known`."""
     build: Callable[[Plant, Tuned], tuple[Policy, Any]]
     note: str
 
@@ -94,25 +96,30 @@ LIMITS = tuple(name for name, known in BASELINES.items() if known.kind == "limit
 SIMPLE = ("none", "static")  # what costs next to nothing
 
 
-def identified(name: str, plant_name: str, report: Report = lambda text, share: None) -> Tuned:
-    """What identification and tuning of a baseline found on the nominal plant, once for all: it is kept in the cache.
+def identified(name: str, of: Known, report: Report = lambda text, share: None) -> Tuned:
+    """What identification and tuning of a baseline found on a plant, once for all: it is kept in the cache.
 
-    `report` is called where it is not there, at the beginning first.
+    Args:
+        name: of the baseline.
+        of: the plant, and what more a limit knows of its scenario.
+        report: called where it is not in the cache, at the beginning first.
 
     Raises:
         ValueError: there is no such plant or baseline, or the identification failed.
     """
     known, file = resolve(name), _file(name)
-    plant, params = make(plant_name)
+    plant, params = make(of.plant)
+    sensor = {"noise": of.noise} if of.noise and file is None else {}
 
     def tune() -> Tuned:
         report("", 0.0)
-        return known.tune(plant, params, jax.random.key(0), BUDGET, report)
+        own = plant.noise_free(params) if of.smooth else params
+        return known.tune(plant, own, jax.random.key(0), BUDGET, report, **sensor)
 
-    key: dict[str, Any] = {"budget": BUDGET}
+    key: dict[str, Any] = {"budget": BUDGET, **(of._asdict() if of.noise else {})}
     if file is not None:
         key |= {"name": name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
-    return cache.cached(f"{plant_name}-{name.rpartition(':')[2]}", key, tune)
+    return cache.cached(f"{of.plant}-{name.rpartition(':')[2]}", key, tune)
 
 
 @cache_of_functions

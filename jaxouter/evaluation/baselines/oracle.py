@@ -62,11 +62,11 @@ def returns(
     return jax.lax.map(mean, actors)
 
 
-def differentiable(config: TrainConfig) -> tuple[DifferentiableRollout, Any]:
+def differentiable(config: TrainConfig, noise: float = 0.0) -> tuple[DifferentiableRollout, Any]:
     """The roll-out with actor and disturbances of a configuration, and the parameters of its plant."""
     trainer, env = build_trainer(config)
     plant = replace(trainer.env.plant, reward_terms=())  # the limit is of what is reported
-    episodes = TrainingEpisodes(plant, config.disturbances, ERROR)
+    episodes = TrainingEpisodes(plant, exact.KnownNoise.of(plant, noise), ERROR)
     return DifferentiableRollout.of(config.pretraining, episodes, trainer.policy, BATCH), env.plant
 
 
@@ -102,13 +102,13 @@ def retrained(config: TrainConfig, report: Report = lambda text, share: None) ->
     return cached(f"{config.plant}-oracle-{config.preset}", key, make_it)
 
 
-def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report) -> Tuned:
+def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report, noise: float = 0.0) -> Tuned:
     """`train` of the actor of the plant's `default` preset; `budget` is no bound: it may take what it needs."""
     del budget
     key_law, key_train = jax.random.split(key)
-    found, history = exact.law(plant, params, key_law)
+    found, history = exact.law(plant, params, key_law, noise)
     history = max(history, len(found.law.y_past))
-    rollout = differentiable(_config(plant, history))[0]
+    rollout = differentiable(_config(plant, history), noise)[0]
     trained = train(rollout, params, padded(found.law, history), key_train, report)
     return trained._replace(settings=trained.settings | {"history": history})
 
