@@ -1,123 +1,122 @@
-"""What a policy trained on many plants holds, beside the baselines, tuned on the nominal one, and beside its own limit.
+"""What one policy of the preset `robust` reaches on the plants of all scenarios; it is not told which one it controls.
 
-Each plant starts 64 times as in training and is then asked for the scenario's set-point, for 600 steps. It is held
-where |y| stays within its limit in all of the last 300. The limit is the oracle, retrained on the same drawn plants.
+    python benchmarks/robust.py runs/pitch-robust-0      # results/robust-pitch.json, tables and a figure
+    python benchmarks/robust.py runs/heaters-robust-*    # several runs differ by their seeds
 
-    python benchmarks/robust.py runs/heaters-robust-0      # results/robust-heaters.json, and two tables
+If plants are unstable alone, one table has the columns of `unstable.py` for them and for the others: from rest without
+and with sensor noise, and the share that is held of the drawn starts that some r~ can bring back. Another has all
+scenarios that are stable alone, compared with the limit in results/compare-PLANT.csv, which knows the plant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from datetime import date
+import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
-import msgspec
+import jax
 import numpy as np
 import tyro
-from msgspec import Struct
-from tables import table
+from tables import made, table
+from unstable import NOISE, RESULTS, drawn, measured, possible
 
 from jaxouter import cli
 from jaxouter.evaluation import cache, scenarios
-from jaxouter.evaluation.baselines import BASELINES, oracle
-from jaxouter.evaluation.metrics import held, mae
-from jaxouter.evaluation.policies import NamedPolicy, baseline
+from jaxouter.evaluation.metrics import mae, share_outside
+from jaxouter.evaluation.policies import NamedPolicy
 from jaxouter.evaluation.rollout import rollout
-from jaxouter.evaluation.scenarios import Scenario
+from jaxouter.training.policy import LearnedParams
 from jaxouter.training.run import RunFolder, surroundings, write_json
 
-RESULTS = Path(__file__).parent / "results"
-LEARNED, LIMIT = "learned", "its limit"
+ALONE = "bank of laws alone"
+DRAWN = {"pitch": ("pitch/paper", "pitch/delay-5.7"), "heaters": ("heaters/paper-4", "heaters/riccati")}
 
 
-def entrants(runs: Sequence[RunFolder]) -> Iterator[tuple[str, list[NamedPolicy]]]:
-    """Name and policies: one for each seed of the runs, and one of all others."""
-    run, (trainer, _) = runs[0], runs[0].trainer
-    states = [one.load(seed)[0] for one in runs for seed in one.seeds]
-    yield (
-        LEARNED,
-        [NamedPolicy(LEARNED, trainer.policy, trainer.policy_params(state), run.config.plant) for state in states],
-    )
-    limit = oracle.retrained(run.config, lambda text, share: print(f"{LIMIT}: {text}", flush=True))
-    yield LIMIT, [NamedPolicy(LIMIT, trainer.policy, oracle.learned(limit), run.config.plant)]
-    for name in BASELINES:
-        yield name, [baseline(name, run.config.plant)]
+class Reached(NamedTuple):
+    """What the seeds of a policy reach on a scenario."""
+
+    mae: list[float]
+    outside: list[float]  # share of the steps outside the limits of y
 
 
-class Held(Struct, frozen=True):
-    """MAE and the share that is held, each the median over the seeds, with the worst seed; None where diverged."""
-
-    mae: float | None
-    worst_mae: float | None
-    held: float
-    worst_held: float
-
-
-def evaluated(policies: Sequence[NamedPolicy], scenario: Scenario) -> Held:
-    """What the seeds of a policy hold on a scenario."""
-    traces = [rollout(named.policy, named.params, scenario) for named in policies]
-    with np.errstate(all="ignore"):
-        maes, shares = [mae(t) for t in traces], [held(t, scenario.plant) for t in traces]
-    middle, worst = (value if np.isfinite(value) else None for value in (median(maes), max(maes)))
-    return Held(middle, worst, median(shares), min(shares))
-
-
-def cell(row: dict[str, float | None], limit: dict[str, float | None]) -> str:
-    """MAE, its ratio to the limit, and the share that is held."""
-    if row["mae"] is None:
-        return "diverged"
-    ratio = "" if limit["mae"] is None or row is limit else f" ({row['mae'] / limit['mae']:.2f})"
-    return f"{row['mae']:.3g}{ratio}, {100 * (row['held'] or 0.0):.0f} %"
+def limits(plant: str) -> dict[str, float]:
+    """MAE of the limit on each scenario."""
+    with (RESULTS / f"compare-{plant}.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["ratio_to_limit"] and row["mae"]]
+    return {row["scenario"]: float(row["mae"]) / float(row["ratio_to_limit"]) for row in rows}
 
 
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     """The command; several runs differ by their seeds."""
     cache.use_compilation_cache()
-    opened = [RunFolder.open(path) for path in runs]
-    config, plant = opened[0].config, opened[0].config.plant
-    plants = [scenarios.perturbed(name) for name in scenarios.for_stability(plant)]
-    catalogue = [scenarios.get(name) for name in scenarios.catalogue(plant)]
-    places = {s.id: scenarios.place(s, *opened[0].drawn) for s in catalogue}
-    started: dict[str, dict[str, Held]] = {}  # rows by policy and scenario
-    asked: dict[str, dict[str, Held]] = {}
-    for name, policies in entrants(opened):
-        print(name, flush=True)
-        started[name] = {scenario.id: evaluated(policies, scenario) for scenario in plants}
-        if name in (LEARNED, LIMIT):
-            asked[name] = {scenario.id: evaluated(policies, scenario) for scenario in catalogue}
-    about = {
-        "date": date.today().isoformat(),
-        "machine": surroundings(),
-        "seeds": [seed for run in opened for seed in run.seeds],
-    }
-    about |= {"preset": config.preset, "ranges": config.randomise, "places": places}
-    found = about | msgspec.to_builtins({"perturbed": started, "scenarios": asked})
-    write_json(RESULTS / f"robust-{plant}.json", found)
-    text = written(found)
+    learned: list[NamedPolicy] = []
+    for run in map(RunFolder.open, runs):
+        policy, plant = run.trainer[0].policy, run.config.plant
+        learned += [NamedPolicy("learned", policy, run.policy(seed)[1], plant) for seed in run.seeds]
+    first, plant = learned[0], learned[0].plant
+    idle = LearnedParams(jax.tree.map(np.zeros_like, first.params.actor), first.params.base)
+    policies = {"learned": learned, ALONE: [NamedPolicy(ALONE, first.policy, idle, plant)]}
+    limit = limits(plant)
+    selected = [scenarios.get(name) for name in scenarios.catalogue(plant) if name in limit]
+    of_stability = [scenarios.get(name) for name in scenarios.for_stability(plant)]
+    could: dict[str, float] = {}
+    held: dict[str, dict[str, list[dict[str, float]]]] = {name: {} for name in policies}
+    for scenario in of_stability if not all(each.stable_alone for each in of_stability) else []:
+        could[scenario.id] = float(np.mean(possible(scenarios.perturbed(scenario.id))))
+        for name, each in policies.items():
+            held[name][scenario.id] = [measured(one, scenario.id) for one in each]
+            print(scenario.id, name, held[name][scenario.id], flush=True)
+    reached: dict[str, dict[str, Reached]] = {}
+    for scenario in selected:
+        if scenario.stable_alone:
+            for name, each in policies.items():
+                traces = [rollout(one.policy, one.params, scenario) for one in each]
+                outside = [share_outside(one, scenario.plant) for one in traces]
+                reached.setdefault(scenario.id, {})[name] = Reached(list(map(mae, traces)), outside)
+            print(scenario.id, reached[scenario.id], flush=True)
+    drawn(dict.fromkeys(DRAWN[plant], first), RESULTS / f"robust-{plant}.png")
+    about: dict[str, Any] = {"machine": surroundings(), "can be held": could, "held": held, "scenarios": reached}
+    write_json(RESULTS / f"robust-{plant}.json", about)
+    tables = [of_plants(could, held)] if could else []
+    tables.append(of_references(reached, limit))
+    spread = f"Median (least to greatest) of {len(learned)} seeds." if len(learned) > 1 else "One seed."
+    command = " ".join(["python benchmarks/robust.py", *map(str, runs)])
+    text = "\n\n".join([*tables, f"{spread} {made(command)}"])
     (RESULTS / f"robust-{plant}.md").write_text(text + "\n")
     print(text)
 
 
-def written(found: dict[str, Any]) -> str:
-    """The tables of a result: drawn starts, scenarios."""
-    started, asked, places = (found[key] for key in ("perturbed", "scenarios", "places"))
-    names = started[LIMIT]
-    rows = [[name, places[name], *(cell(row[name], names[name]) for row in started.values())] for name in names]
-    held = table(["plant", "of the drawn ones", *started], rows)
-    pairs = {name: [asked[each][name]["mae"] or np.inf for each in (LEARNED, LIMIT)] for name in asked[LIMIT]}
-    rows = [
-        [name, places[name], *map("{:.3g}".format, maes), f"{maes[0] / maes[1]:.2f}"] for name, maes in pairs.items()
-    ]
-    scenario = table(["scenario", "of the drawn ones", LEARNED, LIMIT, "ratio"], rows)
-    versions = found["machine"]["versions"]
-    when = (
-        f"Made on {found['date']} with jaxouter {versions['jaxouter']}, jax {versions['jax']}, seeds {found['seeds']}."
-    )
-    return f"{held}\n\n{scenario}\n\n{when}"
+def of_plants(could: Mapping[str, float], held: Mapping[str, Mapping[str, list[dict[str, float]]]]) -> str:
+    """The table of the plants."""
+    rows = []
+    for name, of_scenarios in held.items():
+        for scenario, found in of_scenarios.items():
+            shares = [100.0 * each["held"] / could[scenario] for each in found]
+            of_rest = [cell([each[column] for each in found]) for column in ("mae", "noisy")]
+            rows.append([scenario, name, *of_rest, f"{100 * could[scenario]:.0f} %", cell(shares)])
+    columns = ["plant", "policy", "MAE from rest", f"with noise of {NOISE}", "can be held", "of these held, %"]
+    return table(columns, rows)
+
+
+def of_references(reached: Mapping[str, Mapping[str, Reached]], limit: Mapping[str, float]) -> str:
+    """The table of the scenarios that are stable alone."""
+    rows = []
+    for name, found in reached.items():
+        ours, of_bank = found["learned"], found[ALONE]
+        outside = f"{100 * median(ours.outside):.2g}"
+        ratio = f"{median(ours.mae) / limit[name]:.2f}"
+        rows.append([name, cell(of_bank.mae), cell(ours.mae), outside, f"{limit[name]:.3g}", ratio])
+    columns = ["scenario", ALONE, "learned", "steps outside the limits, %", "limit", "learned / limit"]
+    return table(columns, rows)
+
+
+def cell(values: Sequence[float]) -> str:
+    """Median, least and greatest value."""
+    spread = f" ({min(values):.3g} to {max(values):.3g})" if len(values) > 1 else ""
+    return f"{median(values):.3g}{spread}"
 
 
 if __name__ == "__main__":
-    cli.run(lambda: tyro.cli(main))
+    cli.run(lambda: tyro.cli(main, description=__doc__))

@@ -1,6 +1,6 @@
 """What `default` holds on the paper's two plants that are unstable alone, trained on each of them by itself.
 
-    python benchmarks/unstable.py                # five seeds each; half an hour
+    python benchmarks/unstable.py                # five seeds each; a quarter of an hour
     python benchmarks/unstable.py --seeds 1
 
 From rest: the MAE in 20 s of the scenario, without and with sensor noise of 0.1 crad. Drawn starts: 64 as in training,
@@ -65,19 +65,19 @@ def learned(seed: int, settings: dict[str, Any]) -> tuple[NamedPolicy, float]:
 
 
 def drawn(policies: Mapping[str, NamedPolicy], path: Path) -> None:
-    """The paper's panels: the inner loop alone and with the policy of each case, and r~ below."""
-    on = {f"pitch/{case}": named for case, named in policies.items()}
-    alone = baseline("none", "pitch")
-    inner = {name: rollout(alone.policy, alone.params, scenarios.get(name)) for name in on}
-    with_outer = {name: rollout(named.policy, named.params, scenarios.get(name)) for name, named in on.items()}
-    figures.keep(figures.response([scenarios.get(name) for name in on], inner, with_outer), path)
+    """The paper's panels: the inner loop alone and with the policy for each scenario, and r~ below."""
+    on = {name: scenarios.get(name) for name in policies}
+    alone = baseline("none", next(iter(policies.values())).plant)
+    inner = {name: rollout(alone.policy, alone.params, on[name]) for name in on}
+    with_outer = {name: rollout(named.policy, named.params, on[name]) for name, named in policies.items()}
+    figures.keep(figures.response(list(on.values()), inner, with_outer), path)
 
 
-def measured(named: NamedPolicy, case: str) -> dict[str, float]:
-    """What a policy holds."""
-    alone = scenarios.get(f"pitch/{case}")
-    noisy = replace(scenarios.get(f"pitch/{case}", 32), sensor=sensor.params(noise=NOISE))
-    starts = scenarios.perturbed(f"pitch/{case}")
+def measured(named: NamedPolicy, identifier: str) -> dict[str, float]:
+    """What a policy holds on a scenario."""
+    alone = scenarios.get(identifier)
+    noisy = replace(scenarios.get(identifier, 32), sensor=sensor.params(noise=NOISE))
+    starts = scenarios.perturbed(identifier)
     found = {name: mae(rollout(named.policy, named.params, on)) for name, on in (("mae", alone), ("noisy", noisy))}
     seen = rollout(named.policy, named.params, starts)
     return found | {"held": held(seen, starts.plant)}
@@ -91,9 +91,9 @@ def main(seeds: int = 5) -> None:
         found: list[dict[str, float]] = []
         for seed in range(seeds):
             named, seconds = learned(seed, settings)
-            found.append(measured(named, case) | {"seconds": seconds})
+            found.append(measured(named, f"pitch/{case}") | {"seconds": seconds})
             if (case, seed) == ("delay-5.7", 0):
-                drawn({"paper": learned(0, {})[0], case: named}, RESULTS / "unstable.png")
+                drawn({"pitch/paper": learned(0, {})[0], f"pitch/{case}": named}, RESULTS / "unstable.png")
             print(case, seed, found[-1], flush=True)
         kept[case] = {"can be held": could, "seeds": found}
 

@@ -34,18 +34,18 @@ TOLERANCE = 1e-4  # of the range of r~
 NOT_KEPT = ("lock", "process")
 OFF_POLICY = dict(steps=400, environments=1, epoch=100)
 PRETRAINED = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8))
-DRAWN = dict(environments=2, pretraining=dict(gradient_steps=20, episodes=8, batch_size=8, plants=4))
 PAIRED = dict(pairs=dict(rounds=1, states=64, kept=1, environments=2, horizon=5, updates=2, batch_size=8), compared=8)
-OF_TWO = (0.1, (("d1", 0.45), ("d2", 0.45))), (100.0, (("d1", 5.65), ("d2", 0.6)))
-BANKED = dict(history=10, bank=OF_TWO, environments=2) | dict(
-    pretraining=dict(gradient_steps=20, episodes=8, batch_size=8, closed_loop=8, lags=70, episode_steps=200)
-)
+OF_PITCH = (0.1, (("d1", 0.45), ("d2", 0.45))), (100.0, (("d1", 5.65), ("d2", 0.6)))
+OF_HEATERS = (10.0, (("Pi", 0.42),)), (10.0, (("Pi", 18.0),))
+BANKED = dict(gradient_steps=20, episodes=8, batch_size=8, closed_loop=8)
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": PAIRED | PRETRAINED,
     "scratch": PAIRED | OFF_POLICY,
     "record": PRETRAINED | dict(compared=8),
-    "pitch-robust": BANKED,
-    "heaters-robust": DRAWN,
+    "pitch-robust": dict(
+        history=10, bank=OF_PITCH, environments=2, pretraining=BANKED | dict(lags=70, episode_steps=200)
+    ),
+    "heaters-robust": dict(history=10, bank=OF_HEATERS, environments=2, pretraining=BANKED),
     "paper": OFF_POLICY,
 }
 AGENT = dict(hidden=(16, 16), batch_size=32, prefill=200, replay=400)

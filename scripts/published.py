@@ -35,13 +35,16 @@ MAKERS = (  # what a file's name begins with, the most special first, and what m
     ("heaters-paper", f"{TRAIN} heaters --preset paper --seeds 3; python benchmarks/results.py runs/heaters-paper-0"),
     ("pitch-default", f"{TRAIN} pitch --seeds 5; python benchmarks/results.py runs/pitch-default-0"),
     ("heaters-default", f"{TRAIN} heaters --seeds 5; python benchmarks/results.py runs/heaters-default-0"),
-    ("robust-", f"{TRAIN} PLANT --preset robust --seeds 5; python benchmarks/robust.py runs/PLANT-robust-0"),
+    (
+        "robust-",
+        f"for seed in 0 1 2 3 4; do {TRAIN} PLANT --preset robust --seed $seed --devices 2; done; "
+        "python benchmarks/robust.py runs/PLANT-robust-*",
+    ),
     ("sample-efficiency", "python benchmarks/sample_efficiency.py"),
     ("over-base", "python benchmarks/over_base.py"),
     ("learners-", "python benchmarks/learners.py --plant PLANT"),
     ("time-to-quality", "python benchmarks/time_to_quality.py --peers"),
     ("unstable", "python benchmarks/unstable.py"),
-    ("bank", f"{TRAIN} pitch --preset robust --devices 2; python benchmarks/bank.py runs/pitch-robust-0"),
     ("undecided", "python benchmarks/undecided.py"),
     ("throughput", "python benchmarks/throughput.py --peers"),
     ("controller", "python benchmarks/controller.py"),

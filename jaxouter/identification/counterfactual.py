@@ -8,7 +8,7 @@ response make a plant on which any number of new episodes can be simulated.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import chex
@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from jaxouter.identification.records import Record
-from jaxouter.plants import Plant, simulate
+from jaxouter.plants import Plant
 from jaxouter.plants.base import float_leaves, with_float_leaves
 
 
@@ -65,45 +65,6 @@ def _smoothed(y: np.ndarray, disturbance: np.ndarray, a: np.ndarray) -> np.ndarr
     fast = disturbance - scipy.signal.savgol_filter(disturbance, window, min(2, window - 1))
     effect = np.asarray(scipy.signal.lfilter([1.0], np.append(1.0, -a), fast))
     return np.concatenate([y[:, : -effect.shape[1]], y[:, -effect.shape[1] :] - effect], 1)
-
-
-def simulated(original: Plant, params: Any, key: chex.PRNGKey, episodes: int) -> CounterfactualParams:
-    """Episodes of a plant that can be simulated, and its impulse response; each episode has its own `draw`.
-
-    Exact if the plant is linear and time-invariant. For a plant with inner steps and delay lines it is many times
-    faster than stepping.
-
-    Raises:
-        ValueError: the response half an episode later is different.
-    """
-    *found, early, late = map(np.asarray, _moved(original, params, jax.random.split(key, episodes)))
-    off = np.abs(early[:, : late.shape[1]] - late).max(1)
-    if np.any(off > 1e-3 * np.abs(early).max(1)):
-        raise ValueError(f"plant {original.name!r} responds differently half an episode later")
-    return CounterfactualParams(*(jnp.asarray(x, float) for x in (np.zeros_like(early), early, *found)))
-
-
-@partial(jax.jit, static_argnums=0)
-def _moved(original: Plant, params: Any, keys: chex.PRNGKey) -> Any:
-    """r~, y, y without noise, and the responses to an impulse of r~ at the start and half way; each (E, ...)."""
-    steps, (low, high) = original.episode_steps, original.r_tilde_bounds
-
-    def episode(key: chex.PRNGKey) -> Any:
-        key_draw, key_start, key_run = jax.random.split(key, 3)
-        p = params if original.draw is None else original.draw(key_draw, params)
-        state = original.training_start(key_start, p)
-
-        def y(p: Any, r_tilde: jax.Array) -> jax.Array:
-            return jnp.concatenate([original.output(p, state)[None], simulate(original, p, r_tilde, key_run, state)])
-
-        still = jnp.full(steps, (low + high) / 2)
-        responses = [
-            (y(p, still.at[k].add((high - low) / 2)) - y(p, still))[k + 1 :] / ((high - low) / 2)
-            for k in (0, steps // 2)
-        ]
-        return still, y(p, still), y(original.noise_free(p), still), *responses
-
-    return jax.lax.map(episode, keys, batch_size=256)
 
 
 @cache

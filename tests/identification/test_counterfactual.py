@@ -50,29 +50,6 @@ def test_the_other_past_of_an_episode_is_the_one_the_plant_would_have_had(name, 
     assert np.sqrt(np.mean(error**2)) < within * difference
 
 
-def test_a_known_plant_that_responds_alike_at_all_times_is_simulated_beforehand():
-    """Drawn delays and gains: within 1e-3 crad of the plant stepped itself."""
-    plant, params = plants.randomised(*make("pitch"), (("d1", 0.0, 0.6), ("d2", 0.0, 3.0), ("gain", 0.8, 1.2)))
-    known = counterfactual.simulated(plant, params, KEY, 4)
-    asked = counterfactual.plant(plant, plant.episode_steps)
-    r_tilde = telegraph(jax.random.key(1), plant.episode_steps, *plant.r_tilde_bounds, 0.05)
-
-    def itself(key):
-        key_draw, key_start, key_run = jax.random.split(key, 3)
-        drawn = plant.draw(key_draw, params)
-        return simulate(plant, drawn, r_tilde, key_run, plant.training_start(key_start, drawn))
-
-    found = jax.vmap(lambda episode: simulate(asked, episode, r_tilde, KEY, asked.init(KEY, episode)))(known)
-    expected = jax.vmap(itself)(jax.random.split(KEY, 4))
-    assert np.abs(np.asarray(expected)).max() > 5.0
-    np.testing.assert_allclose(found, expected, atol=1e-3)
-
-
-def test_a_plant_whose_response_changes_is_not():
-    with pytest.raises(ValueError, match="plant 'heaters' responds differently half an episode later"):
-        counterfactual.simulated(*make("heaters"), KEY, 2)
-
-
 def test_under_the_recorded_input_it_is_the_record():
     plant, params = lag.make()
     data = record(plant, params, KEY, 4)

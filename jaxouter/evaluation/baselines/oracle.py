@@ -9,7 +9,6 @@ the learner's, its history as long as that of the law. It reads the plant's equa
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,16 +22,15 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxouter.agents.whitening import Whitening
 from jaxouter.evaluation.baselines import exact
 from jaxouter.evaluation.baselines.tuning import Report, learner
-from jaxouter.evaluation.cache import Tuned, cached
-from jaxouter.identification import counterfactual
-from jaxouter.identification.steady_state import LEVELS, static
+from jaxouter.evaluation.cache import Tuned
+from jaxouter.identification.steady_state import LEVELS
 from jaxouter.loop.episodes import TrainingEpisodes
 from jaxouter.loop.policy import LinearLaw, padded
 from jaxouter.loop.rewards import RewardConfig
-from jaxouter.plants import Plant, make
-from jaxouter.training.config import TrainConfig, to_dict
+from jaxouter.plants import Plant
+from jaxouter.training.config import TrainConfig
 from jaxouter.training.policy import LearnedParams, LearnedPolicy
-from jaxouter.training.pretraining import ADAM, DifferentiableRollout, PretrainingState, cosine, pretrain
+from jaxouter.training.pretraining import ADAM, DifferentiableRollout, cosine
 from jaxouter.training.trainer import build as build_trainer
 
 SEEDS = 3
@@ -44,7 +42,6 @@ MOST = FIRST_STAGE * 2 ** (STAGES - 1)  # gradient steps
 ENOUGH = 0.01  # relative gain of the return by doubling, below which training ends
 CHUNK = 50  # gradient steps between two reports
 ERROR = RewardConfig(beta_h=0.0, beta_b=0.0, delta_b=50.0)  # the error, and what is outside the limits
-DRAWN = 2048  # plants that are simulated beforehand
 VALIDATION = 512  # training episodes on which the best seed is chosen
 
 
@@ -68,38 +65,6 @@ def differentiable(config: TrainConfig, noise: float = 0.0) -> tuple[Differentia
     plant = replace(trainer.env.plant, reward_terms=())  # the limit is of what is reported
     episodes = TrainingEpisodes(plant, exact.KnownNoise.of(plant, noise), ERROR)
     return DifferentiableRollout.of(config.pretraining, episodes, trainer.policy, BATCH), env.plant
-
-
-def retrained(config: TrainConfig, report: Report = lambda text, share: None) -> Tuned:
-    """The limit of a configuration that draws plants: its own pretraining, but on these plants themselves.
-
-    Those that respond alike at all times are simulated beforehand. From the cache where it was made before.
-    """
-    start = config.pretraining
-
-    def make_it() -> Tuned:
-        trainer, params = build_trainer(config)
-        key_actor, key_static, key_drawn, *keys = jax.random.split(jax.random.key(0), 5)
-        plant, of_plant = replace(trainer.env.plant, reward_terms=()), params.plant
-        law = static(*make(config.plant), key_static)[1]
-        learned = LearnedParams(trainer.agent.actor(trainer.agent.init(key_actor)), law)
-        longer = replace(plant, episode_steps=start.episode_steps or plant.episode_steps)
-        try:
-            of_plant = counterfactual.simulated(longer, of_plant, key_drawn, DRAWN)
-            plant = counterfactual.plant(plant, longer.episode_steps)
-        except ValueError:
-            pass  # stepped itself
-
-        def heard(at: PretrainingState, actor: Callable[[], Any]) -> None:
-            report(f"{at.done:,} of {start.gradient_steps:,} gradient steps", int(at.done) / start.gradient_steps)
-
-        episodes = TrainingEpisodes(plant, config.disturbances, ERROR)
-        actor = pretrain(start, episodes, of_plant, trainer.policy, learned, keys, heard)
-        steps = start.gradient_steps * start.batch_size * longer.episode_steps
-        return kept(actor, law, {"gradient_steps": start.gradient_steps}, steps)
-
-    key = {"config": to_dict(replace(config, seed=0, seeds=1, devices=1))}
-    return cached(f"{config.plant}-oracle-{config.preset}", key, make_it)
 
 
 def tune(plant: Plant, params: Any, key: chex.PRNGKey, budget: int, report: Report, noise: float = 0.0) -> Tuned:

@@ -10,16 +10,14 @@ import pytest
 from jaxouter import plants
 from jaxouter.agents.whitening import Whitening
 from jaxouter.evaluation.baselines import mpc, oracle, pi
-from jaxouter.evaluation.baselines.tuning import score, training_episodes
+from jaxouter.evaluation.baselines.tuning import training_episodes
 from jaxouter.evaluation.metrics import mae
 from jaxouter.evaluation.rollout import rollout as rollout_of
 from jaxouter.identification import linear_models, records, steady_state
 from jaxouter.loop.policy import Linear
-from jaxouter.training.config import PretrainingConfig, preset
+from jaxouter.training.config import preset
 from jaxouter.training.policy import LearnedParams
-from jaxouter.training.trainer import build
 from tests import lag
-from tests.training.small import small as small_run
 
 KEY = jax.random.key(0)
 SMALL = {"SEEDS": 1, "BATCH": 16, "FIRST_STAGE": 100, "STAGES": 2, "VALIDATION": 64}
@@ -92,21 +90,6 @@ def test_built_policy_is_the_one_that_was_chosen(tuned):
     one = jax.tree.map(lambda leaf: leaf[None], params.actor)
     value = oracle.returns(rollout, one, params.base, lag.make()[1], key)
     assert float(value[0]) == pytest.approx(max(map(max, tuned.settings["returns"])), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_retrained_on_drawn_plants_it_beats_the_static_prefilter_on_them_and_is_made_once():
-    start = PretrainingConfig(gradient_steps=100, batch_size=16)
-    config = small_run("lag", pretraining=start, randomise=(("K", 0.3, 0.7),), base="static", steps=0)
-    said = []
-    found = oracle.retrained(config, lambda text, share: said.append((text, share)))
-    assert said == [("50 of 100 gradient steps", 0.5), ("100 of 100 gradient steps", 1.0)]
-    trainer, params = build(config)
-    episodes = training_episodes(trainer.env.plant, params.plant, jax.random.key(1), 64)
-    alone = score(*steady_state.static(*lag.make(), KEY), episodes)
-    assert score(trainer.policy, oracle.learned(found), episodes) > 0.85 * alone  # both negative
-    again = oracle.retrained(config, lambda text, share: said.append((text, share)))
-    assert (again.seconds, len(said)) == (found.seconds, 2)
 
 
 def test_folded_acts_like_the_network_on_whitened_observations(rollout):
