@@ -45,7 +45,7 @@ INSIDE = 0.8  # share of the set-point range in closed loop
 DITHER, RATE = 1 / 12, 0.2  # of half the range of r~; redraws per control step
 DISTURBANCES = Disturbances(noise=0.0075)  # under which laws are compared
 CLOSED = 128  # episodes in closed loop
-ROUNDS = 2  # of episodes in closed loop, each under the law of all before
+ROUNDS = 2  # of episodes in closed loop, each under the law of all before; half of them begin at rest
 LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 
 
@@ -98,7 +98,7 @@ def identify(
     both = opened
     for i, key_run in enumerate(keys):
         ran = (episodes + i) // ROUNDS
-        both = joined(both, in_closed_loop(plant, params, found.chosen.law, key_run, ran))
+        both = joined(both, in_closed_loop(plant, params, found.chosen.law, key_run, ran, ran // 2))
         found = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
         f"{plant.name} is unstable alone; {len(found.params.y)} of {len(both.y)} recorded starts can be brought back, "
