@@ -1,8 +1,7 @@
 """A bank of base laws for many plants: each is identified from records of its own, some of them in closed loop.
 
 Episodes under random r~ give a first model and its LQ law. Under this law and a dither more episodes are recorded, in
-two rounds; half of them begin at rest, where little is known of the plant until r~ has moved it. The pretraining of one
-actor for all of these plants replays the episodes (`counterfactual`).
+two rounds. The pretraining of one actor for all of these plants replays the episodes (`counterfactual`).
 """
 
 from __future__ import annotations
@@ -138,7 +137,7 @@ def _law(
     for i, key_run in enumerate(keys):
         law, _ = _of(plant, known, price, lags)
         ran = (closed_loop + i) // unstable.ROUNDS
-        known = unstable.joined(known, unstable.in_closed_loop(plant, params, law, key_run, ran, ran // 2))
+        known = unstable.joined(known, unstable.in_closed_loop(plant, params, law, key_run, ran))
     law, model = _of(plant, known, price, lags)
     if np.isfinite(known.y).all():
         return _Law(law, model, known)

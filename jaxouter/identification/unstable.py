@@ -45,7 +45,7 @@ INSIDE = 0.8  # share of the set-point range in closed loop
 DITHER, RATE = 1 / 12, 0.2  # of half the range of r~; redraws per control step
 DISTURBANCES = Disturbances(noise=0.0075)  # under which laws are compared
 CLOSED = 128  # episodes in closed loop
-ROUNDS = 2  # of episodes in closed loop, each under the law of all before; half of them begin at rest
+ROUNDS = 2  # of episodes in closed loop, each under the law of all before
 LATE = 0.15  # share of an episode, at its end, in which y must be within bounds
 
 
@@ -98,7 +98,7 @@ def identify(
     both = opened
     for i, key_run in enumerate(keys):
         ran = (episodes + i) // ROUNDS
-        both = joined(both, in_closed_loop(plant, params, found.chosen.law, key_run, ran, ran // 2))
+        both = joined(both, in_closed_loop(plant, params, found.chosen.law, key_run, ran))
         found = _law(plant, both, key_law, history, disturbances, static)
     warnings.warn(
         f"{plant.name} is unstable alone; {len(found.params.y)} of {len(both.y)} recorded starts can be brought back, "
@@ -109,19 +109,18 @@ def identify(
     return found
 
 
-def in_closed_loop(
-    plant: Plant, params: Any, law: LinearLaw, key: chex.PRNGKey, episodes: int, at_rest: int = 0
-) -> Record:
+def in_closed_loop(plant: Plant, params: Any, law: LinearLaw, key: chex.PRNGKey, episodes: int) -> Record:
     """Episodes under a law and a dither; those that leave the plant's bounds are left out.
+
+    Half of them begin at rest, where little is known of the plant until r~ has moved it; the others as in training.
 
     Starts that are hard to hold are among those under random r~; more of them would outweigh how well y follows.
 
     Args:
         plant, params, law, key: the loop; all random numbers.
         episodes: to run.
-        at_rest: of these, how many begin at rest; the others begin as in training.
     """
-    begins_at_rest = jnp.arange(episodes) < at_rest
+    begins_at_rest = jnp.arange(episodes) < episodes // 2
     closed = Record(*map(np.asarray, _closed_loop(plant, params, law, jax.random.split(key, episodes), begins_at_rest)))
     stayed = np.isfinite(within(closed, plant.divergence_bounds, 0.0).y).all(1)
     return Record(*(each[stayed] for each in closed))
