@@ -18,6 +18,7 @@ from jaxouter.evaluation import policies as evaluation
 from jaxouter.evaluation import scenarios
 from jaxouter.evaluation.metrics import FiguresOfMerit
 from jaxouter.evaluation.results import Comparison, PolicyInfo, Row, Summary
+from jaxouter.evaluation.scenarios import Known
 from jaxouter.plants import REGISTRY, host, registry
 from jaxouter.progress import FIRST_PHASE, Progress, TimeLeft
 from jaxouter.training.config import preset
@@ -337,20 +338,22 @@ def test_evaluate_says_what_it_identifies_first(monkeypatch, clock):
     out = io.StringIO()
     of = Progress(Console(file=out, width=140), clock=clock)
 
-    def slow(name, plant, report):
+    def slow(name, known, report):
         report("", 0.0)
         for share in (0.1, 0.2, 0.3):
             clock.now += 5
             report(f"{share:.0%} of it", share)
         said.append(of.line)
-        return evaluation.NamedPolicy(name, None, (), plant)
+        return evaluation.NamedPolicy(name, None, (), known.plant)
 
     said = []
     monkeypatch.setattr(evaluation, "baseline", slow)
-    evaluation.named("oracle", "pitch", of)
+    evaluation.named("oracle", Known("pitch", 0.2), of)
     identifying, told, tuning = out.getvalue().splitlines()
     assert (identifying, tuning) == ("identifying oracle", "tuning oracle")
-    assert told.startswith("oracle on pitch: A correction of lq-exact by the learner's network, trained by")
+    assert told.startswith(
+        "oracle on pitch with sensor noise of 0.2: A correction of lq-exact by the learner's network, trained by"
+    )
     assert said == ["tuning oracle  30% of it  30 %  0:35 left"]
 
 
