@@ -1,9 +1,9 @@
-"""What DDPG adds to what it starts from, and whether that is ever worse: 20 seeds of `default` on six loops.
+"""What rounds of pairs add to what they start from, and whether that is ever worse: 20 seeds of `default` on six loops.
 
     python benchmarks/over_base.py                    # an hour
     python benchmarks/over_base.py pitch --seeds 5    # one loop
 
-What it starts from is the base law, on heaters the pretrained policy: the same training without pairs. MAEs are those
+They start from the base law, or from the pretrained policy: the same training without pairs. MAEs are those
 of scenarios that training never sees. The return is that of the reward that is trained on, on 512 fresh training
 episodes that all policies of a seed share. Table and numbers go to results/.
 """
@@ -102,9 +102,9 @@ def table(name: str, found: Mapping[str, Any]) -> Iterator[str]:
 
 def written(known: Mapping[str, Any]) -> str:
     """Both tables."""
-    lines = ["| loop | scenario | `static` | `lq` | before DDPG | `default` | DDPG |", "|---|---|---|---|---|---|---|"]
+    lines = ["| loop | scenario | `static` | `lq` | before pairs | `default` | pairs |", "|---|---|---|---|---|---|---|"]
     lines += [row for name, found in known.items() for row in table(name, found)]
-    lines += ["", "Gain of DDPG in return on fresh training episodes, in percent:", ""]
+    lines += ["", "Gain by pairs in return on fresh training episodes, in percent:", ""]
     lines += ["| loop | seeds | least | median | greatest | date |", "|---|---|---|---|---|---|"]
     for name, found in known.items():
         gains = [100 * each for each in found["gain"]]
