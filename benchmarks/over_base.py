@@ -102,7 +102,10 @@ def table(name: str, found: Mapping[str, Any]) -> Iterator[str]:
 
 def written(known: Mapping[str, Any]) -> str:
     """Both tables."""
-    lines = ["| loop | scenario | `static` | `lq` | before pairs | `default` | pairs |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| loop | scenario | `static` | `lq` | before pairs | `default` | pairs |",
+        "|---|---|---|---|---|---|---|",
+    ]
     lines += [row for name, found in known.items() for row in table(name, found)]
     lines += ["", "Gain by pairs in return on fresh training episodes, in percent:", ""]
     lines += ["| loop | seeds | least | median | greatest | date |", "|---|---|---|---|---|---|"]

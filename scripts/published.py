@@ -22,7 +22,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 TRAIN = "python -m jaxouter.train"
 COMPARED = (
     f"{TRAIN} PLANT --seeds 5; {TRAIN} PLANT --preset scratch --seeds 5; python -m jaxouter.compare PLANT "
-    "--run runs/PLANT-default-0 runs/PLANT-scratch-0; python benchmarks/comparison.py runs/compare-pitch runs/compare-heaters"
+    "--run runs/PLANT-default-0 runs/PLANT-scratch-0; "
+    "python benchmarks/comparison.py runs/compare-pitch runs/compare-heaters"
 )
 MAKERS = (  # what a file's name begins with, the most special first, and what makes it
     (

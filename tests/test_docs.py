@@ -11,6 +11,7 @@ import pytest
 
 from tests.load import ROOT, load
 
+badges = load("scripts", "badges")
 docs = load("scripts", "docs")
 pages = load("scripts", "pages")
 published = load("scripts", "published")
@@ -73,6 +74,10 @@ def test_what_is_shown_is_there_and_has_a_command_that_makes_it():
         assert (ROOT / path).is_file(), path
     assert "README.md" in shown["paper-cases.md"]
     assert f"Made on {published.made('unstable.md')} on " in (published.RESULTS / "unstable.md").read_text()
+
+
+def test_badges_say_what_the_project_declares():
+    assert {path.stem: path.read_text() for path in badges.FOLDER.glob("*.svg")} == badges.badges()
 
 
 PAGE = """# Page
