@@ -1,6 +1,8 @@
-"""The results table of the README, from run folders; their summaries and main figures are kept in benchmarks/results.
+"""What runs reached and what they cost, from run folders; summaries and main figures are kept in benchmarks/results.
 
-python benchmarks/results.py runs/pitch-default-0 runs/pitch-paper-0 runs/heaters-default-0 runs/heaters-paper-0
+    python benchmarks/results.py runs/{pitch,heaters}-{default,scratch,paper}-0
+
+`costs.md` has the environment steps, gradient steps and wall time of each run.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from statistics import median
 from typing import Any
 
 import tyro
+from tables import made, table
 
 from jaxouter.evaluation import scenarios
 from jaxouter.training.run import RunFolder
@@ -25,8 +28,18 @@ def maes(results: list[dict[str, Any]], policy: str, scenario: str) -> list[floa
     return [float("inf") if value is None else value for value in values]
 
 
+def cost(run: RunFolder, seconds: float) -> list[str]:
+    """Cells of a run that trained all its seeds in so many seconds; all are of one seed."""
+    config = run.config
+    steps = config.environment_steps - config.identification_steps
+    updates = config.pretraining.gradient_steps + config.total_updates
+    each = config.identification_steps, steps, updates
+    return [f"{config.plant}, `{config.preset}`", *(f"{n:,}" for n in each), f"{seconds / config.seeds:.0f} s"]
+
+
 def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
     rows: dict[str, dict[str, str]] = {}
+    costs = []
     for path in runs:
         run = RunFolder.open(path)
         name = f"{run.config.plant}-{run.config.preset}"
@@ -35,7 +48,9 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
         shutil.copy(run.figures / "paper.png", RESULTS / f"{name}.png")
         if run.config.epochs:
             shutil.copy(run.figures / "learning-curve.png", RESULTS / f"{name}-learning.png")
-        results = json.loads(content)["results"]
+        summary = json.loads(content)
+        results = summary["results"]
+        costs.append(cost(run, summary["training_seconds"]))
         for scenario in scenarios.reported(run.config.plant):
             row = rows.setdefault(scenario, {})
             row["inner"], row["static"] = (f"{maes(results, p, scenario)[0]:.2f}" for p in ("none", "static"))
@@ -43,11 +58,12 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
             row["published"] = "" if paper is None else f"{paper[1]:.2f} of {paper[0]:.2f}"
             values = maes(results, "learned", scenario)
             row[run.config.preset] = f"{median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
-    print("| scenario | inner loop alone | static prefilter | the paper's DRL | ours, `paper` | ours, `default` |")
-    print("|---|---|---|---|---|---|")
-    for scenario, row in rows.items():
-        cells = [row.get(key, "") for key in ("inner", "static", "published", "paper", "default")]
-        print(f"| {scenario} | " + " | ".join(cells) + " |")
+    columns = ["run", "recorded steps", "environment steps", "gradient steps", "wall time"]
+    about = "Of one seed; wall time: that of all seeds, one after another, by their number, compilation included."
+    command = f"python benchmarks/results.py {' '.join(map(str, runs))}"
+    (RESULTS / "costs.md").write_text(f"{table(columns, costs)}\n\n{about} {made(command)}\n")
+    columns = ["inner", "static", "published", "paper", "scratch", "default"]
+    print(table(["scenario", *columns], ([name, *(row.get(key, "") for key in columns)] for name, row in rows.items())))
 
 
 if __name__ == "__main__":
