@@ -1,12 +1,13 @@
 """Our learners side by side, each from scratch on the static prefilter: MAE over wall time and environment steps.
 
-    python benchmarks/learners.py                    # pitch, five seeds of each; about an hour on 2 cores
+    python benchmarks/learners.py                    # pitch, five seeds of each; an hour on 2 cores
     python benchmarks/learners.py --plant heaters
     python benchmarks/learners.py --peers            # pitch alone: also those of stable-baselines3 and sbx; hours
 
 Each run is a process of its own that begins with nothing cached, see `time_to_quality.py`; its time counts from its
 start, imports and compilation included. `ddpg` learns without pairs here, as the others do; `ddpg, then pairs` is the
-preset `scratch`. Training never sees the scenario of the MAE. Table, figure and numbers go to results/learners-PLANT.
+preset `scratch`. `r not held` shows what holding the set-point is worth to a learner of either kind. Training never
+sees the scenario of the MAE. Table, figure and numbers go to results/learners-PLANT.
 """
 
 from __future__ import annotations
@@ -106,6 +107,7 @@ def main(
     learners = {name: runs(name) for name in agent or agents.AGENTS}
     if not agent:
         learners["ddpg, then pairs"] = ("--preset", "scratch")
+        learners |= {f"{name}, r not held": (*runs(name), "--agent.no-hold") for name in ("ddpg", "ppo")}
     found: dict[str, list[list[Point]]] = {}
     for name, options in learners.items():
         for seed in range(seeds):
