@@ -25,6 +25,10 @@ COMPARED = (
     "--run runs/PLANT-default-0 runs/PLANT-scratch-0; "
     "python benchmarks/comparison.py runs/compare-pitch runs/compare-heaters"
 )
+RUNS = (
+    f"{TRAIN} PLANT --seeds 5; {TRAIN} PLANT --preset scratch --seeds 5; "
+    "python benchmarks/results.py runs/{pitch,heaters}-{default,scratch}-0"
+)
 MAKERS = (  # what a file's name begins with, the most special first, and what makes it
     (
         "animation",
@@ -34,8 +38,9 @@ MAKERS = (  # what a file's name begins with, the most special first, and what m
     ("paper-cases", COMPARED),
     ("pitch-paper", f"{TRAIN} pitch --preset paper --seeds 3; python benchmarks/results.py runs/pitch-paper-0"),
     ("heaters-paper", f"{TRAIN} heaters --preset paper --seeds 3; python benchmarks/results.py runs/heaters-paper-0"),
-    ("pitch-default", f"{TRAIN} pitch --seeds 5; python benchmarks/results.py runs/pitch-default-0"),
-    ("heaters-default", f"{TRAIN} heaters --seeds 5; python benchmarks/results.py runs/heaters-default-0"),
+    ("pitch-", RUNS),
+    ("heaters-", RUNS),
+    ("costs", RUNS),
     (
         "robust-",
         f"for seed in 0 1 2 3 4; do {TRAIN} PLANT --preset robust --seed $seed --devices 2; done; "
