@@ -33,6 +33,8 @@ RESULTS = Path(__file__).parent / "results"
 SCENARIO = {"pitch": "pitch/paper", "heaters": "heaters/paper-4"}
 LEVELS = ("static", "lq")
 POINTS = 200  # of a curve
+HIGHEST = 1.8  # times the limit, in the figure
+NOT_HELD = ", r not held"
 
 
 def runs(name: str) -> tuple[str, ...]:
@@ -56,13 +58,18 @@ def draw(found: dict[str, list[list[Point]]], levels: dict[str, float], scenario
     for axes, by, what in zip(both, ("seconds", "steps"), ("wall time, s", "environment steps"), strict=True):
         for i, (name, of_seeds) in enumerate(found.items()):
             at, maes = curve(of_seeds, by)
-            axes.plot(at, np.median(maes, 0), lw=1.6, color=f"C{i}", label=name)
-            axes.fill_between(at, maes.min(0), maes.max(0), color=f"C{i}", alpha=0.15, lw=0)
+            as_came = name.endswith(NOT_HELD)
+            color = f"C{list(found).index(name.removesuffix(NOT_HELD))}" if as_came else f"C{i}"
+            axes.plot(at, np.median(maes, 0), lw=1.6, color=color, ls=":" if as_came else "-", label=name)
+            if not as_came:
+                axes.fill_between(at, maes.min(0), maes.max(0), color=color, alpha=0.1, lw=0)
         for (name, value), style in zip(levels.items(), cycle((":", "--", "-.")), strict=False):
             axes.axhline(value, color=figures.INNER, ls=style, lw=1.2, label=f"{name} {value:.3g}")
         axes.set_xscale("log")
         axes.set_xlabel(what)
+        axes.set_ylim(0.98 * levels["limit"], HIGHEST * levels["limit"])
         figures.log_axis(axes, "y")
+    figures.log_axis(both[0], "x")
     both[0].set_ylabel(f"MAE on {scenario}, {unit}")
     figure.legend(*both[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8.5, frameon=False)
     return figures.styled(figure)
@@ -107,7 +114,7 @@ def main(
     learners = {name: runs(name) for name in agent or agents.AGENTS}
     if not agent:
         learners["ddpg, then pairs"] = ("--preset", "scratch")
-        learners |= {f"{name}, r not held": (*runs(name), "--agent.no-hold") for name in ("ddpg", "ppo")}
+        learners |= {f"{name}{NOT_HELD}": (*runs(name), "--agent.no-hold") for name in ("ddpg", "ppo")}
     found: dict[str, list[list[Point]]] = {}
     for name, options in learners.items():
         for seed in range(seeds):
