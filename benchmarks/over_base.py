@@ -3,7 +3,7 @@
     python benchmarks/over_base.py                    # an hour
     python benchmarks/over_base.py pitch --seeds 5    # one loop
 
-They start from the base law, or from the pretrained policy: the same training without pairs. MAEs are those
+They start from what the same training gives without them: base law or pretrained policy. MAEs are those
 of scenarios that training never sees. The return is that of the reward that is trained on, on 512 fresh training
 episodes that all policies of a seed share. Table and numbers go to results/.
 """

@@ -59,7 +59,7 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]]) -> None:
             values = maes(results, "learned", scenario)
             row[run.config.preset] = f"{median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
     columns = ["run", "recorded steps", "environment steps", "gradient steps", "wall time"]
-    about = "Of one seed; wall time: that of all seeds, one after another, by their number, compilation included."
+    about = "Each number is for one seed. Wall time is that of all seeds divided by their number, compilation included."
     command = f"python benchmarks/results.py {' '.join(map(str, runs))}"
     (RESULTS / "costs.md").write_text(f"{table(columns, costs)}\n\n{about} {made(command)}\n")
     columns = ["inner", "static", "published", "paper", "scratch", "default"]
