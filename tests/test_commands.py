@@ -55,7 +55,8 @@ def test_train_writes_the_run_folder(trained):
     assert config["integral_steps"] == 20.0  # of the preset
     for seed in (3, 4):
         rows = [json.loads(line) for line in (folder / f"seed-{seed}" / "metrics.jsonl").read_text().splitlines()]
-        assert [row["steps"] for row in rows] == [1120, 1600, 8000]
+        compared = 2 * 16 * 200
+        assert [row["steps"] for row in rows] == [1120 + compared, 1600 + 2 * compared, 1600 + 3 * compared]
         assert {"mae", "reward", "critic_loss", "saturation", "actor_gradient", "q_start"} <= set(rows[0])
     names = {path.name for path in (folder / "figures").iterdir()}
     drawn = ["paper", "learning-curve", *(name.replace("/", "-") for name in PLACES)]

@@ -98,7 +98,7 @@ class LiveFolder:
             trainer, _ = run.trainer
             learned, _ = run.load(seed)
             live = Live.of(trainer.config, trainer.env, own.takeover, "trained")
-            state = live.trained(key, learned, trainer.agent.actor(learned.agent))
+            state = live.trained(key, learned, trainer.policy_params(learned).actor)
         else:
             options = PlantOptions(r_tilde_bounds=own.r_tilde_bounds, setpoint_range=own.setpoint_range)
             live = Live.of(*declared(own.dt, own.episode_steps, options), own.takeover, "static")

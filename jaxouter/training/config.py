@@ -113,8 +113,8 @@ class TrainConfig:
     pairs: PairsConfig = field(default_factory=PairsConfig)
     """Rounds of learning from pairs, after the agent's own steps; only a better actor is kept."""
     compared: int = 512
-    """Fresh training episodes of the gate: after a round of pairs the new actor is kept if it is better on them than
-    the old one, and at the end the policy if it is better than the base law alone. 0: no check at the end."""
+    """Fresh training episodes of the gate. After an epoch or a round of pairs the new actor is kept if it is better on
+    them than the best so far, and at the end the policy if it is better than the base law alone. 0: without a gate."""
     explored_steps: Annotated[int, tyro.conf.Suppress] = 0
     """Control steps spent to identify the dead time, for settings that were not given."""
     plant_options: Annotated[PlantOptions, tyro.conf.arg(name="")] = field(default_factory=PlantOptions)
@@ -226,15 +226,19 @@ class TrainConfig:
         """Epochs in all: those of the agent, then each round of pairs, then the check."""
         return self.agent_epochs + self.pairs.rounds + (self.compared > 0)
 
+    def agent_steps(self, epoch: int) -> int:
+        """Environment steps of one of the agent's epochs."""
+        return min(self.epoch, self.steps - self.agent.data.before - epoch * self.epoch)
+
     def steps_of(self, epoch: int, episode_steps: int) -> tuple[int, int]:
         """Control steps of the plant and updates of an epoch, given the length of the plant's episodes."""
+        each = self.compared * episode_steps
         if epoch < self.agent_epochs:
-            steps = min(self.epoch, self.steps - self.agent.data.before - epoch * self.epoch)
-            return steps, self.agent_updates * steps // (self.steps - self.agent.data.before)
+            steps = self.agent_steps(epoch)
+            return steps + 2 * each, self.agent_updates * steps // (self.steps - self.agent.data.before)
         if epoch < self.agent_epochs + self.pairs.rounds:
-            compared = (1 + len(SHARES)) * self.compared * episode_steps
-            return self.pairs.steps(episode_steps) + compared, self.pairs.updates_per_round
-        return 2 * self.compared * episode_steps, 0
+            return self.pairs.steps(episode_steps) + (1 + len(SHARES)) * each, self.pairs.updates_per_round
+        return 2 * each, 0
 
     @property
     def gated(self) -> bool:

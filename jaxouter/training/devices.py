@@ -235,6 +235,7 @@ class Fleet:
             key=SEED,
             steps=SEED,
             pairs=SEED,
+            kept=SEED,
         )
 
     def _place(self, spec: P, leaves: Sequence[Any]) -> jax.Array:

@@ -15,10 +15,17 @@ from jaxouter.loop.bank import BaseLaw
 from jaxouter.loop.environment import Environment, EnvParams, EnvState
 from jaxouter.loop.observation import Signals
 from jaxouter.loop.policy import affine
-from jaxouter.training.policy import LearnedParams, LearnedPolicy
+from jaxouter.training.policy import LearnedPolicy
 
 AXIS = "environments"  # mesh axis of a learner's shards
 EPISODES = 16  # per diagnosis
+
+
+class Kept(NamedTuple):
+    """Actors of the agent's own epochs."""
+
+    best: Any  # so far
+    average: Any  # of the recent ones
 
 
 class TrainState(NamedTuple):
@@ -33,6 +40,7 @@ class TrainState(NamedTuple):
     key: chex.PRNGKey
     steps: jax.Array  # int32, environment steps of the agent so far
     pairs: Any = ()  # of the rounds of pairs
+    kept: Kept | tuple[()] = ()  # () if the agent's own epochs compare no actors
 
 
 def step_with(
@@ -111,10 +119,6 @@ class Environments:
         nothing = jnp.zeros((observer.laws, observer.lags))
         return bank.of([middle] * observer.laws, nothing, nothing, observer.y_scale)
 
-    def policy_params(self, state: TrainState) -> LearnedParams:
-        """The current parameters of the policy."""
-        return LearnedParams(self.agent.actor(state.agent), state.base)
-
     def keys(self, state: TrainState, steps: int, n: int) -> list[chex.PRNGKey]:
         """`n` arrays of keys (steps,), for the next `steps` steps of all environments; differ between shards.
 
@@ -186,11 +190,11 @@ class Environments:
 
     def _episode(self, key: chex.PRNGKey, state: TrainState, params: EnvParams) -> tuple[jax.Array, jax.Array]:
         """The agent's value of an episode's start, and the actual discounted return."""
-        gamma, learned = self.agent.data.discount, self.policy_params(state)
+        gamma, actor = self.agent.data.discount, self.agent.actor(state.agent)
 
         def step(carry: Any, key: chex.PRNGKey) -> tuple[Any, jax.Array]:
             obs, env, weight = carry
-            action = self.policy.action(learned.actor, obs)
+            action = self.policy.action(actor, obs)
             obs, env, reward, terminated = step_with(self.env, self.policy, state.base, params, env, action, key)
             return (obs, env, weight * gamma * jnp.where(terminated, 0.0, 1.0)), weight * reward
 

@@ -150,7 +150,7 @@ def train(
         for seeds in rounds:
             begun = time.perf_counter()
             if epoch < cfg.agent_epochs:
-                states[seeds], metrics = fleet.epoch(states[seeds], params, steps)
+                states[seeds], metrics = fleet.epoch(states[seeds], params, cfg.agent_steps(epoch))
             elif epoch < cfg.agent_epochs + cfg.pairs.rounds:
                 states[seeds], metrics = fleet.improve(states[seeds], params)
             else:

@@ -64,20 +64,19 @@ class Improvement:
         metrics |= {"kept": jnp.where(kept, shares[best], 0.0), "rate": state.rate}
         return state._replace(rate=rate), actor, metrics | Comparison(*best_of_all)._asdict()
 
-    def check(
-        self, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey
+    def better(
+        self, before: Any, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey, errors: float = 0.0
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """The actor if it is better than none by more than the error, else one whose action is zero: the base law.
+        """The actor if its gain over the one before is above so many standard errors, else the one before.
 
         Returns:
-            That actor, and metrics: kept (1 or 0); gain, error and worst over the base law, as for a round.
+            That actor, and metrics: kept (1 or 0); gain, error and worst, as for a round.
         """
-        nothing = jax.tree.map(jnp.zeros_like, actor)
         one = jax.tree.map(lambda leaf: leaf[None], actor)
-        found = compare(self.env, self.policy, nothing, one, base, params, key, self.compared)
+        found = compare(self.env, self.policy, before, one, base, params, key, self.compared)
         found = Comparison(*(leaf[0] for leaf in found))
-        kept = found.gain > found.error
-        actor = jax.tree.map(lambda old, new: jnp.where(kept, old, new), actor, nothing)
+        kept = found.gain > errors * found.error
+        actor = jax.tree.map(lambda new, old: jnp.where(kept, new, old), actor, before)
         return actor, {"kept": jnp.where(kept, 1.0, 0.0), **found._asdict()}
 
     def pairs(self, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey) -> Pairs:

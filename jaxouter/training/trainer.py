@@ -13,7 +13,9 @@ from typing import Any, cast
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
 from jaxouter.agents import Agent, OffPolicy
 from jaxouter.agents.agent import OffPolicyAgent
@@ -31,7 +33,7 @@ from jaxouter.plants import Plant
 from jaxouter.plants import make as make_plant
 from jaxouter.plants.base import RUN_ONCE
 from jaxouter.training.config import TrainConfig
-from jaxouter.training.environments import AXIS, Environments, TrainState
+from jaxouter.training.environments import AXIS, Environments, Kept, TrainState
 from jaxouter.training.improvement import Improvement
 from jaxouter.training.off_policy import FIELDS, OffPolicyDriver, Windows
 from jaxouter.training.on_policy import OnPolicyDriver
@@ -43,6 +45,8 @@ DIAGNOSIS = 2  # likewise
 BASE = 3  # likewise
 PAIRS = 4  # likewise
 CHECK = 5  # likewise
+KEPT = 6  # likewise
+NEWEST = 0.3  # share of an epoch's actor in the average of actors
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,20 @@ class Trainer:
         return self.environments.agent
 
     def policy_params(self, state: TrainState) -> LearnedParams:
-        """The current parameters of the policy."""
-        return self.environments.policy_params(state)
+        """The parameters of the policy: of the best actor so far, where actors are compared."""
+        actor = state.kept.best if isinstance(state.kept, Kept) else self.agent.actor(state.agent)
+        return LearnedParams(actor, state.base)
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether the agent's own epochs compare actors."""
+        return bool(self.config.agent_epochs and self.config.compared)
+
+    def with_actor(self, state: TrainState, actor: Any) -> TrainState:
+        """The state with another actor, of the policy and of the agent."""
+        best, average = (jax.tree.map(jnp.copy, actor) for _ in Kept._fields)  # copies, as the state is donated
+        kept = Kept(best, average) if self._keeps else ()
+        return state._replace(agent=self.agent.with_actor(state.agent, actor), kept=kept)
 
     def start(
         self,
@@ -112,11 +128,8 @@ class Trainer:
         if not start.gradient_steps:
             return state
 
-        def with_actor(actor: Any) -> TrainState:
-            return state._replace(agent=self.agent.with_actor(state.agent, actor))
-
         def reported(at: PretrainingState, actor: Callable[[], Any]) -> None:
-            report(at, lambda: with_actor(actor()))
+            report(at, lambda: self.with_actor(state, actor()))
 
         if found is None:
             model, of_model = model_of(start, plant, params.plant, data, self.env.observer.history)
@@ -124,7 +137,7 @@ class Trainer:
             model, of_model = counterfactual.plant(plant, found.params.a.shape[1]), found.params
         episodes = TrainingEpisodes(model, self.config.disturbances, self.config.reward)
         learned, more = self.policy_params(state), (reported, begin, devices, say)
-        return with_actor(pretrain(start, episodes, of_model, self.policy, learned, keys, *more))
+        return self.with_actor(state, pretrain(start, episodes, of_model, self.policy, learned, keys, *more))
 
     def _base(
         self, middle: LinearLaw, params: EnvParams, data: Sequence[Record], key: chex.PRNGKey, say: Say
@@ -181,10 +194,12 @@ class Trainer:
     def fresh(self, key: chex.PRNGKey, params: EnvParams) -> TrainState:
         """Random networks, reset environments, no data; a zero action is the middle of the range of r~."""
         state = self.driver.fresh(key, params)
+        actor = self.agent.actor(state.agent)
+        if self._keeps:
+            state = self.with_actor(state, actor)
         if not self.config.pairs.rounds:
             return state
-        key_pairs, actor = jax.random.fold_in(state.key, PAIRS), self.agent.actor(state.agent)
-        return state._replace(pairs=self.improvement.init(key_pairs, actor))
+        return state._replace(pairs=self.improvement.init(jax.random.fold_in(state.key, PAIRS), actor))
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def prefill(self, state: TrainState, params: EnvParams) -> TrainState:
@@ -193,24 +208,35 @@ class Trainer:
 
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Explore and learn for `steps` environment steps; see the driver."""
-        return self.driver.epoch(state, params, steps)
+        """Explore and learn for `steps` environment steps, see the driver; the best actor so far is kept.
+
+        What is compared is the average of recent actors, which errs less than each. The agent learns on from its own,
+        as it has to pass worse ones.
+        """
+        state, metrics = self.driver.epoch(state, params, steps)
+        if not isinstance(state.kept, Kept):
+            return state, metrics
+        key, before = jax.random.fold_in(jax.random.fold_in(state.key, KEPT), state.steps), state.kept
+        average = optax.incremental_update(self.agent.actor(state.agent), before.average, NEWEST)
+        best, compared = self.improvement.better(before.best, average, state.base, params, key)
+        return state._replace(kept=Kept(best, average)), metrics | compared
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def improve(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
         """A round of pairs; see `Improvement`."""
         key = jax.random.fold_in(jax.random.fold_in(state.key, PAIRS), state.pairs.rounds)
-        before = self.agent.actor(state.agent)
+        before = self.policy_params(state).actor
         pairs, actor, metrics = self.improvement.round(state.pairs, before, state.base, params, key)
-        return state._replace(agent=self.agent.with_actor(state.agent, actor), pairs=pairs), metrics
+        return self.with_actor(state._replace(pairs=pairs), actor), metrics
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def check(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
         """The state with an actor that is no worse than the base law alone; see `Improvement`."""
         rounds = state.pairs.rounds if self.config.pairs.rounds else 0  # other episodes before them
-        key, before = jax.random.fold_in(jax.random.fold_in(state.key, CHECK), rounds), self.agent.actor(state.agent)
-        actor, metrics = self.improvement.check(before, state.base, params, key)
-        return state._replace(agent=self.agent.with_actor(state.agent, actor)), metrics
+        key, actor = jax.random.fold_in(jax.random.fold_in(state.key, CHECK), rounds), self.policy_params(state).actor
+        nothing = jax.tree.map(jnp.zeros_like, actor)  # the base law alone
+        actor, metrics = self.improvement.better(nothing, actor, state.base, params, key, 1.0)
+        return self.with_actor(state, actor), metrics
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:

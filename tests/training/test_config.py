@@ -143,4 +143,6 @@ def test_ranges_survive_json():
 def test_last_epoch_may_be_shorter():
     config = replace(preset("pitch"), steps=8_000 + 6_400 + 160, epoch=6_400)
     assert config.agent_epochs == 2
-    assert [config.steps_of(epoch, 200) for epoch in range(2)] == [(6_400, 1_600), (160, 40)]
+    assert [config.agent_steps(epoch) for epoch in range(2)] == [6_400, 160]
+    compared = 2 * 512 * 200
+    assert [config.steps_of(epoch, 200) for epoch in range(2)] == [(6_400 + compared, 1_600), (160 + compared, 40)]

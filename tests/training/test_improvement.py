@@ -94,12 +94,30 @@ def test_in_the_end_the_base_law_remains_where_what_was_learned_is_worse(started
     last = max(layers)  # which is linear: the opposite corrections
     bad = {"params": layers | {last: jax.tree.map(jnp.negative, layers[last])}}
     for actor, kept in ((trainer.policy_params(good).actor, 1.0), (bad, 0.0)):
-        before = good._replace(agent=trainer.agent.with_actor(good.agent, actor))
+        before = trainer.with_actor(good, actor)
         after, found = trainer.check(jax.tree.map(jnp.copy, before), params)
         assert float(found["kept"]) == kept
         chex.assert_trees_all_equal(
             trainer.policy_params(after).actor, jax.tree.map(lambda leaf, kept=kept: kept * leaf, actor)
         )
+
+
+def test_epochs_of_the_agent_keep_the_best_actor_and_learn_on(started):
+    trainer, params, state = started
+    good, _ = improved(trainer, params, state)
+    kept = trainer.policy_params(good).actor
+    nothing = jax.tree.map(jnp.zeros_like, kept)
+    before = trainer.prefill(jax.tree.map(jnp.copy, trainer.with_actor(good, nothing)), params)
+    for best in (kept, nothing):
+        state = jax.tree.map(jnp.copy, before._replace(kept=before.kept._replace(best=best)))
+        after, row = trainer.epoch(state, params, trainer.config.epoch)
+        assert float(row["kept"]) == (float(row["gain"]) > 0.0)
+        wanted = after.kept.average if row["kept"] else best
+        chex.assert_trees_all_equal(trainer.policy_params(after).actor, wanted)
+        assert best is nothing or not row["kept"]  # an epoch from nothing is no match for rounds of pairs
+        newest = jax.tree.map(lambda leaf: 0.3 * leaf, trainer.agent.actor(after.agent))  # and 0.7 of nothing
+        chex.assert_trees_all_close(after.kept.average, newest, rtol=1e-5)
+        assert int(after.agent.learner.updates) > 0
 
 
 def test_before_the_rounds_a_pretrained_actor_is_kept_only_where_it_is_better_than_the_base_law(tmp_path):
