@@ -2,25 +2,28 @@
 
     python benchmarks/learners.py                    # pitch, five seeds of each; an hour on 2 cores
     python benchmarks/learners.py --plant heaters
+    python benchmarks/learners.py --agent td3 sac    # some of them; results of the others stay as they are
     python benchmarks/learners.py --peers            # pitch alone: also those of stable-baselines3 and sbx; hours
 
 Each run is a process of its own that begins with nothing cached, see `time_to_quality.py`; its time counts from its
 start, imports and compilation included. `ddpg` learns without pairs here, as the others do; `ddpg, then pairs` is the
 preset `scratch`. `r not held` shows what holding the set-point is worth to a learner of either kind. Training never
-sees the scenario of the MAE. Table, figure and numbers go to results/learners-PLANT.
+sees the scenario of the MAE. Table, figure and numbers go to results/learners-PLANT after each learner.
 """
 
 from __future__ import annotations
 
 import json
+from datetime import date
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
-from tables import machine, made, table
+from tables import machine, table
 from time_to_quality import NEAR, PEERS, Point, cell, limit, of_peers, ours, peers, reached
 
 from jaxouter import agents, cli
@@ -34,12 +37,16 @@ SCENARIO = {"pitch": "pitch/paper", "heaters": "heaters/paper-4"}
 LEVELS = ("static", "lq")
 POINTS = 200  # of a curve
 HIGHEST = 1.8  # times the limit, in the figure
-NOT_HELD = ", r not held"
+NOT_HELD, PAIRED = ", r not held", "ddpg, then pairs"
+LEARNERS = (*agents.AGENTS, PAIRED, *(f"{name}{NOT_HELD}" for name in ("ddpg", "ppo")))
 
 
 def runs(name: str) -> tuple[str, ...]:
     """Options of the command for a learner."""
-    return ("--preset", "scratch", "--agent", name, "--pairs.rounds", "0")
+    if name == PAIRED:
+        return ("--preset", "scratch")
+    held = ("--agent.no-hold",) if name.endswith(NOT_HELD) else ()
+    return ("--preset", "scratch", "--agent", name.removesuffix(NOT_HELD), "--pairs.rounds", "0", *held)
 
 
 def curve(of_seeds: list[list[Point]], by: str) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +106,7 @@ def main(
 
     Args:
         plant: pitch or heaters.
-        agent: learners; default: all.
+        agent: learners, by their names in the table; default: all.
         seeds: of each, from 0.
         with_peers: also other libraries' learners.
         minutes: longest time of a run; counts where a level is never reached.
@@ -111,26 +118,36 @@ def main(
         figure_of_merit = evaluate_on(baseline(name, plant), [on])[scenario].figures.mae
         assert figure_of_merit is not None
         levels[name] = figure_of_merit
-    learners = {name: runs(name) for name in agent or agents.AGENTS}
-    if not agent:
-        learners["ddpg, then pairs"] = ("--preset", "scratch")
-        learners |= {f"{name}{NOT_HELD}": (*runs(name), "--agent.no-hold") for name in ("ddpg", "ppo")}
-    found: dict[str, list[list[Point]]] = {}
-    for name, options in learners.items():
-        for seed in range(seeds):
-            found.setdefault(name, []).append(list(ours(options, seed, 0.0, seconds, plant)))
-            print(name, seed, found[name][-1][-1:], flush=True)
-    if with_peers:
-        python = of_peers()
-        for library, learner in PEERS:
-            for seed in range(seeds):
-                points = list(peers(python, library, learner, seed, NEAR[-1] * least, seconds))
-                found.setdefault(f"{library} {learner}", []).append(points)
-                print(library, learner, seed, points[-1:], flush=True)
     stem = RESULTS / f"learners-{plant}"
-    about: dict[str, Any] = {"machine": machine(), "levels": levels, "minutes": minutes}
-    write_json(stem.with_suffix(".json"), about | {"runs": found})
-    unit = figures.symbol(on.plant.y_unit)
+    path = stem.with_suffix(".json")
+    known = json.loads(path.read_text()) if path.exists() else {"dates": {}, "runs": {}}
+    dates: dict[str, str] = known["dates"]
+    found: dict[str, list[list[Point]]] = known["runs"]
+    wanted = {name: partial(ours, runs(name), below=0.0, seconds=seconds, plant=plant) for name in agent or LEARNERS}
+    if with_peers:
+        of = partial(partial, peers, of_peers(), below=NEAR[-1] * least, seconds=seconds)
+        wanted |= {f"{library} {learner}": of(library, learner) for library, learner in PEERS}
+    for name, run in wanted.items():
+        found[name], dates[name] = [], date.today().isoformat()
+        for seed in range(seeds):
+            found[name].append(list(run(seed=seed)))
+            print(name, seed, found[name][-1][-1:], flush=True)
+        found = dict(sorted(found.items(), key=lambda item: [*LEARNERS, item[0]].index(item[0])))
+        about = {"machine": machine(), "levels": levels, "minutes": minutes, "dates": dates}
+        write_json(path, about | {"runs": found})
+        write(stem, found, dates, levels, scenario, seconds)
+
+
+def write(
+    stem: Path,
+    found: dict[str, list[list[Point]]],
+    dates: dict[str, str],
+    levels: dict[str, float],
+    scenario: str,
+    seconds: float,
+) -> None:
+    """The figure and the table."""
+    unit = figures.symbol(scenarios.get(scenario).plant.y_unit)
     figures.keep(draw(found, levels, scenario, unit), stem.with_suffix(".png"))
     columns = [
         "learner",
@@ -138,17 +155,19 @@ def main(
         "environment steps",
         "wall time",
         *(f"to {near:g}" for near in NEAR),
+        "date",
     ]
+    on, command = machine(), f"python benchmarks/learners.py --plant {stem.name.removeprefix('learners-')}"
     said = ", ".join(f"{name} {value:.3f}" for name, value in levels.items())
-    command = f"python benchmarks/learners.py --plant {plant}" + (" --peers" if with_peers else "")
+    seeds = min(len(of_seeds) for of_seeds in found.values())
     text = [
         f"MAE on {scenario}, median (least to greatest) of {seeds} seeds, and wall time of the whole process until it "
-        f"is within a factor of the limit; {minutes:g} minutes where it never is. {said.capitalize()} {unit}.",
-        table(columns, rows(found, least, seconds)),
-        made(command),
+        f"is within a factor of the limit; {seconds / 60:g} minutes where it never is. {said.capitalize()} {unit}.",
+        table(columns, ([*cells, dates[cells[0]]] for cells in rows(found, levels["limit"], seconds))),
+        f"On {on['cores']} cores of {on['cpu']} (jax {on['jax']}, python {on['python']}): `{command}`",
     ]
     stem.with_suffix(".md").write_text("\n\n".join(text) + "\n")
-    print(json.dumps(levels), text[1], sep="\n")
+    print(text[1], flush=True)
 
 
 if __name__ == "__main__":
