@@ -260,7 +260,7 @@ class Fleet:
 
     @property
     def check(self) -> jax.stages.Wrapped:
-        """`Trainer.check` for every seed, `check(states, params) -> states, metrics`; donates the states."""
+        """`Trainer.check` for every seed, `check(states, params, final) -> states, metrics`; donates the states."""
         return _jitted(self)[3]
 
     @property
@@ -275,14 +275,18 @@ class Fleet:
 @cache  # so that equal fleets share compiled functions
 def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, ...]:
     def mapped(function: Callable[..., Any], out_specs: Any) -> Callable[..., Any]:
-        def of_one(states: TrainState, params: EnvParams) -> Any:
+        def of_one(states: TrainState, *given: Any) -> Any:
             state = jax.tree.map(lambda leaf: jnp.squeeze(leaf, 0), states)
-            return jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), function(state, params))
+            return jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), function(state, *given))
 
         # No check of replication: it has no benefit here, and scans would need casts.
-        return jax.shard_map(
-            of_one, mesh=fleet.mesh, in_specs=(fleet.layout, P()), out_specs=out_specs, check_vma=False
-        )
+        return lambda states, *given: jax.shard_map(
+            of_one,
+            mesh=fleet.mesh,
+            in_specs=(fleet.layout, *(P() for _ in given)),
+            out_specs=out_specs,
+            check_vma=False,
+        )(states, *given)
 
     # Fix the layout of the results; XLA might choose another one, and the next call would compile again.
     layout = jax.tree.map(lambda spec: NamedSharding(fleet.mesh, spec), fleet.layout)
@@ -304,8 +308,8 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, ...]:
         return mapped(fleet.trainer.improve, (fleet.layout, SEED))(states, params)
 
     @partial(jax.jit, donate_argnums=0, out_shardings=with_metrics, compiler_options=RUN_ONCE)
-    def check(states: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
-        return mapped(fleet.trainer.check, (fleet.layout, SEED))(states, params)
+    def check(states: TrainState, params: EnvParams, final: bool) -> tuple[TrainState, dict[str, jax.Array]]:
+        return mapped(fleet.trainer.check, (fleet.layout, SEED))(states, params, final)
 
     return prefill, epoch, improve, check
 

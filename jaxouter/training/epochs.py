@@ -136,7 +136,7 @@ def train(
         compared: dict[int, Row] = {}
         for seeds in rounds if cfg.gated else ():
             say("compiling", 0, 0)
-            states[seeds], metrics = fleet.check(states[seeds], params)
+            states[seeds], metrics = fleet.check(states[seeds], params, True)
             compared |= {seed: of_seed(devices.get(metrics), i) for i, seed in enumerate(seeds)}
         rates = {"seconds": (time.perf_counter() - begun) / cfg.seeds}
         for seed, state in every_seed():  # the result of pretraining is the row of epoch 0
@@ -151,10 +151,13 @@ def train(
             begun = time.perf_counter()
             if epoch < cfg.agent_epochs:
                 states[seeds], metrics = fleet.epoch(states[seeds], params, cfg.agent_steps(epoch))
+                if cfg.compared:
+                    states[seeds], found = fleet.check(states[seeds], params, False)
+                    metrics |= found
             elif epoch < cfg.agent_epochs + cfg.pairs.rounds:
                 states[seeds], metrics = fleet.improve(states[seeds], params)
             else:
-                states[seeds], metrics = fleet.check(states[seeds], params)
+                states[seeds], metrics = fleet.check(states[seeds], params, True)
             metrics = devices.get(metrics)  # waits for the epoch to end
             seconds = time.perf_counter() - begun
             rates = {

@@ -65,7 +65,7 @@ class Improvement:
         return state._replace(rate=rate), actor, metrics | Comparison(*best_of_all)._asdict()
 
     def better(
-        self, before: Any, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey, errors: float = 0.0
+        self, before: Any, actor: Any, base: BaseLaw, params: EnvParams, key: chex.PRNGKey, errors: chex.Numeric
     ) -> tuple[Any, dict[str, jax.Array]]:
         """The actor if its gain over the one before is above so many standard errors, else the one before.
 

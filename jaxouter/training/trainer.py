@@ -45,7 +45,6 @@ DIAGNOSIS = 2  # likewise
 BASE = 3  # likewise
 PAIRS = 4  # likewise
 CHECK = 5  # likewise
-KEPT = 6  # likewise
 NEWEST = 0.3  # share of an epoch's actor in the average of actors
 
 
@@ -208,18 +207,12 @@ class Trainer:
 
     @partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
     def epoch(self, state: TrainState, params: EnvParams, steps: int) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Explore and learn for `steps` environment steps, see the driver; the best actor so far is kept.
-
-        What is compared is the average of recent actors, which errs less than each. The agent learns on from its own,
-        as it has to pass worse ones.
-        """
+        """Explore and learn for `steps` environment steps; see the driver."""
         state, metrics = self.driver.epoch(state, params, steps)
         if not isinstance(state.kept, Kept):
             return state, metrics
-        key, before = jax.random.fold_in(jax.random.fold_in(state.key, KEPT), state.steps), state.kept
-        average = optax.incremental_update(self.agent.actor(state.agent), before.average, NEWEST)
-        best, compared = self.improvement.better(before.best, average, state.base, params, key)
-        return state._replace(kept=Kept(best, average)), metrics | compared
+        average = optax.incremental_update(self.agent.actor(state.agent), state.kept.average, NEWEST)
+        return state._replace(kept=state.kept._replace(average=average)), metrics
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
     def improve(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -230,13 +223,32 @@ class Trainer:
         return self.with_actor(state._replace(pairs=pairs), actor), metrics
 
     @partial(jax.jit, static_argnums=0, donate_argnums=1)
-    def check(self, state: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
-        """The state with an actor that is no worse than the base law alone; see `Improvement`."""
+    def check(
+        self, state: TrainState, params: EnvParams, final: chex.Numeric = True
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """Keep the better of two actors, by fresh episodes.
+
+        In the end (`final`) the best actor so far is kept if it is better than the base law alone by more than the
+        error, else the law. After an epoch of the agent the average of recent actors, which errs less than each, is
+        kept if it is better than the best so far. The agent then learns on from its own actor, as it has to pass worse
+        ones. Both are one function, so that it is compiled once.
+
+        Returns:
+            The state, and metrics as of `Improvement.better`.
+        """
+        final = jnp.asarray(final)
         rounds = state.pairs.rounds if self.config.pairs.rounds else 0  # other episodes before them
-        key, actor = jax.random.fold_in(jax.random.fold_in(state.key, CHECK), rounds), self.policy_params(state).actor
-        nothing = jax.tree.map(jnp.zeros_like, actor)  # the base law alone
-        actor, metrics = self.improvement.better(nothing, actor, state.base, params, key, 1.0)
-        return self.with_actor(state, actor), metrics
+        key, best = jax.random.fold_in(jax.random.fold_in(state.key, CHECK), rounds), self.policy_params(state).actor
+        nothing = jax.tree.map(jnp.zeros_like, best)  # the base law alone
+        if not isinstance(state.kept, Kept):
+            actor, metrics = self.improvement.better(nothing, best, state.base, params, key, 1.0)
+            return self.with_actor(state, actor), metrics
+        either = partial(jax.tree.map, partial(jnp.where, final))
+        before, actor = either((nothing, best), (best, state.kept.average))
+        key = jax.random.fold_in(jax.random.fold_in(key, state.steps), final)
+        actor, metrics = self.improvement.better(before, actor, state.base, params, key, jnp.where(final, 1.0, 0.0))
+        agent, average = either((self.agent.with_actor(state.agent, actor), actor), (state.agent, state.kept.average))
+        return state._replace(agent=agent, kept=Kept(actor, average)), metrics
 
     @partial(jax.jit, static_argnums=0, compiler_options=RUN_ONCE)
     def diagnose(self, state: TrainState, params: EnvParams) -> dict[str, jax.Array]:

@@ -110,7 +110,8 @@ def test_epochs_of_the_agent_keep_the_best_actor_and_learn_on(started):
     before = trainer.prefill(jax.tree.map(jnp.copy, trainer.with_actor(good, nothing)), params)
     for best in (kept, nothing):
         state = jax.tree.map(jnp.copy, before._replace(kept=before.kept._replace(best=best)))
-        after, row = trainer.epoch(state, params, trainer.config.epoch)
+        state, _ = trainer.epoch(state, params, trainer.config.epoch)
+        after, row = trainer.check(state, params, False)
         assert float(row["kept"]) == (float(row["gain"]) > 0.0)
         wanted = after.kept.average if row["kept"] else best
         chex.assert_trees_all_equal(trainer.policy_params(after).actor, wanted)
