@@ -307,7 +307,9 @@ def _jitted(fleet: Fleet) -> tuple[jax.stages.Wrapped, ...]:
     def improve(states: TrainState, params: EnvParams) -> tuple[TrainState, dict[str, jax.Array]]:
         return mapped(fleet.trainer.improve, (fleet.layout, SEED))(states, params)
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=with_metrics, compiler_options=RUN_ONCE)
+    often = fleet.trainer.config.agent_epochs > 0
+
+    @partial(jax.jit, donate_argnums=0, out_shardings=with_metrics, compiler_options=options if often else RUN_ONCE)
     def check(states: TrainState, params: EnvParams, final: bool) -> tuple[TrainState, dict[str, jax.Array]]:
         return mapped(fleet.trainer.check, (fleet.layout, SEED))(states, params, final)
 
